@@ -1,1 +1,2 @@
-fn main() {}
+//! bench
+fn main() { divff::bench_mlp() }

@@ -1,0 +1,244 @@
+//! What is learned: encodings, small networks, the three streams; forward and backward.
+//!
+//! Inside, lengths are in *units*: world coordinates minus the box's smallest corner, divided by the box's longest
+//! side, so that the box is `[0, extent]` with `max(extent) == 1` whatever the scene's own size and place.
+
+pub mod codes;
+pub mod config;
+pub mod hashgrid;
+pub mod mlp;
+pub mod stream;
+
+use std::ops::Range;
+
+use glam::{DVec3, Vec3};
+use serde::{Deserialize, Serialize};
+
+pub use self::config::{FieldConfig, StreamConfig};
+use self::codes::Trajectory;
+use self::hashgrid::{HashGrid, Row};
+use self::stream::{StreamNet, StreamRanges};
+use crate::scene::{Aabb, Scene, Split};
+
+/// The three parts of an egocentric scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Stream {
+    /// What stays: world coordinates, no time.
+    Persistent,
+    /// What is moved now and then: world coordinates and time.
+    Dynamic,
+    /// The wearer's body: camera coordinates and time.
+    Actor,
+}
+
+impl Stream {
+    /// All three, in the order of every `[_; 3]`.
+    pub const ALL: [Self; 3] = [Self::Persistent, Self::Dynamic, Self::Actor];
+
+    /// Lower-case name as used in files and on the command line.
+    pub fn name(self) -> &'static str {
+        ["persistent", "dynamic", "actor"][self as usize]
+    }
+}
+
+/// Between world coordinates and the field's units.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Normalisation {
+    /// World position of the unit origin.
+    pub origin: DVec3,
+    /// World length of one unit.
+    pub scale: f64,
+    /// The box in units; its largest component is 1.
+    pub extent: Vec3,
+}
+
+impl Normalisation {
+    /// The box mapped to `[0, extent]`.
+    pub fn new(bounds: Aabb) -> Self {
+        let size = bounds.max - bounds.min;
+        let scale = size.max_element();
+        Self { origin: bounds.min, scale, extent: (size / scale).as_vec3() }
+    }
+
+    /// World to units; f64 until the origin is subtracted.
+    pub fn to_unit(&self, p: DVec3) -> Vec3 {
+        ((p - self.origin) / self.scale).as_vec3()
+    }
+
+    /// Units to world.
+    pub fn to_world(&self, p: Vec3) -> DVec3 {
+        p.as_dvec3() * self.scale + self.origin
+    }
+}
+
+/// Which part of the flat weight vector is what.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Layout {
+    /// Networks and codes of each stream; empty ranges for an absent stream.
+    pub streams: [StreamRanges; 3],
+    /// Exposure: per knot, gain (log) and offset of the three channels.
+    pub exposure: Range<usize>,
+    /// Pose refinement: per knot, a rotation (rad) and a translation (units) in the camera's axes.
+    pub pose: Range<usize>,
+    /// The rig: rotation, translation shared by all frames, and relative change of the focal length.
+    pub rig: Range<usize>,
+    /// Length of the whole vector.
+    pub len: usize,
+}
+
+/// The shape of the whole field: everything but the learned numbers.
+#[derive(Clone, Debug)]
+pub struct Field {
+    /// How it was asked for.
+    pub config: FieldConfig,
+    /// World ↔ units.
+    pub normalisation: Normalisation,
+    /// The streams that this scene has; `None` for one that is absent.
+    pub nets: [Option<StreamNet>; 3],
+    /// Trajectories of the frame codes (persistent: none).
+    pub codes: [Option<Trajectory>; 3],
+    /// Per-frame exposure, width 6.
+    pub exposure: Trajectory,
+    /// Per-frame pose refinement, width 6.
+    pub pose: Trajectory,
+    /// Where the dense parameters are.
+    pub layout: Layout,
+    /// Hash tables `[stream][level][row]`.
+    pub tables: [Vec<Vec<Row>>; 3],
+    /// Networks, codes, exposure and poses, by `layout`.
+    pub weights: Vec<f32>,
+    /// Closest distance that is rendered, units.
+    pub near: f32,
+    /// Farthest the actor reaches, units.
+    pub actor_far: f32,
+    /// What a ray that leaves the box sees, sRGB 0–1.
+    pub background: Vec3,
+}
+
+/// Width of the view encoding: spherical harmonics of degree 1 and 2.
+pub const VIEW: usize = 8;
+
+impl Field {
+    /// An untrained field for the given streams of a scene.
+    pub fn new(config: &FieldConfig, scene: &Scene, streams: [bool; 3], seed: u64) -> Self {
+        let normalisation = Normalisation::new(scene.bounds);
+        let extent = normalisation.extent;
+        let times: Vec<f32> =
+            scene.frames.iter().filter(|f| f.split == Split::Train).map(|f| f.time as f32).collect();
+        let net = |stream: Stream| {
+            let c = config.stream(stream);
+            let grid = match stream {
+                Stream::Actor => {
+                    HashGrid::new(Vec3::ONE, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows)
+                }
+                _ => HashGrid::new(extent, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows),
+            };
+            let view = if stream == Stream::Persistent { VIEW } else { 0 };
+            StreamNet::new(grid, c.hidden, c.layers, c.code, view, c.density_bias)
+        };
+        let code = |stream: Stream| {
+            let c = config.stream(stream);
+            (c.code > 0).then(|| match c.knots {
+                0 => Trajectory::at(times.clone(), c.code),
+                n => Trajectory::even(n, c.code),
+            })
+        };
+        let nets = Stream::ALL.map(|s| streams[s as usize].then(|| net(s)));
+        let codes = Stream::ALL.map(|s| if streams[s as usize] { code(s) } else { None });
+        let exposure = Trajectory::at(times.clone(), 6);
+        let pose = Trajectory::at(times, 6);
+        let layout = Layout::new(&nets, &codes, &exposure, &pose);
+        let diagonal = extent.length();
+        let mut field = Self {
+            config: config.clone(),
+            normalisation,
+            tables: nets.each_ref().map(|n| n.as_ref().map_or(Vec::new(), empty_tables)),
+            weights: vec![0.0; layout.len],
+            nets,
+            codes,
+            exposure,
+            pose,
+            layout,
+            near: config.near * diagonal,
+            actor_far: config.actor_reach * diagonal,
+            background: Vec3::splat(0.5),
+        };
+        field.init(seed);
+        field
+    }
+
+    /// The network of a stream, if the scene has it.
+    pub fn net(&self, stream: Stream) -> Option<&StreamNet> {
+        self.nets[stream as usize].as_ref()
+    }
+
+    fn init(&mut self, seed: u64) {
+        let mut rng = crate::rng::Rng::new(seed, 0, 0);
+        for s in Stream::ALL {
+            let Some(net) = &self.nets[s as usize] else { continue };
+            let r = &self.layout.streams[s as usize];
+            self.weights[r.trunk.clone()].copy_from_slice(&net.trunk.init(|| rng.uniform()));
+            self.weights[r.head.clone()].copy_from_slice(&net.head.init(|| rng.uniform()));
+            for w in &mut self.weights[r.code.clone()] {
+                *w = 0.1 * (2.0 * rng.uniform() - 1.0);
+            }
+            for row in self.tables[s as usize].iter_mut().flatten() {
+                *row = std::array::from_fn(|_| 1e-2 * (2.0 * rng.uniform() - 1.0));
+            }
+        }
+    }
+}
+
+impl FieldConfig {
+    /// The configuration of one stream.
+    pub fn stream(&self, stream: Stream) -> &StreamConfig {
+        [&self.persistent, &self.dynamic, &self.actor][stream as usize]
+    }
+}
+
+impl Layout {
+    fn new(
+        nets: &[Option<StreamNet>; 3],
+        codes: &[Option<Trajectory>; 3],
+        exposure: &Trajectory,
+        pose: &Trajectory,
+    ) -> Self {
+        let mut len = 0;
+        let mut take = |n: usize| {
+            len += n;
+            len - n..len
+        };
+        let streams = std::array::from_fn(|s| {
+            let net = nets[s].as_ref();
+            StreamRanges {
+                trunk: take(net.map_or(0, |n| n.trunk.parameters())),
+                head: take(net.map_or(0, |n| n.head.parameters())),
+                code: take(codes[s].as_ref().map_or(0, Trajectory::parameters)),
+            }
+        });
+        let exposure = take(exposure.parameters());
+        let pose = take(pose.parameters());
+        let rig = take(8);
+        Self { streams, exposure, pose, rig, len }
+    }
+}
+
+fn empty_tables(net: &StreamNet) -> Vec<Vec<Row>> {
+    net.grid.levels.iter().map(|l| vec![[0.0; hashgrid::FEATURES]; l.rows]).collect()
+}
+
+/// Real spherical harmonics of degree 1 and 2 of a unit direction, without their constants' signs.
+pub fn view_encoding(d: Vec3) -> [f32; VIEW] {
+    let Vec3 { x, y, z } = d;
+    [
+        0.488_602_5 * y,
+        0.488_602_5 * z,
+        0.488_602_5 * x,
+        1.092_548_4 * x * y,
+        1.092_548_4 * y * z,
+        0.315_391_57 * (3.0 * z * z - 1.0),
+        1.092_548_4 * x * z,
+        0.546_274_2 * (x * x - y * y),
+    ]
+}

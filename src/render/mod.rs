@@ -1,0 +1,6 @@
+//! Rays, empty-space skipping and compositing; forward and backward.
+
+pub mod composite;
+pub mod density_grid;
+pub mod rays;
+pub mod sampler;

@@ -1,0 +1,105 @@
+//! Where along a ray to look: intervals of equal weight under the running density grids.
+
+use glam::Vec3;
+
+use super::density_grid::DensityGrid;
+use super::rays::Ray;
+
+/// Most steps a ray takes through the density grids.
+const MAX_STEPS: usize = 768;
+
+/// A ray is cut off where less than this is left of its light.
+const SATURATED: f32 = 1e-4;
+
+/// Settings of the sampler.
+#[derive(Clone, Copy, Debug)]
+pub struct Sampling {
+    /// Intervals per ray.
+    pub count: usize,
+    /// Step through the grids, units.
+    pub step: f32,
+    /// Share of the samples spread evenly over what is not hidden, whatever the grids say.
+    pub explore: f32,
+    /// The grids' densities are multiplied by this.
+    pub sharpness: f32,
+}
+
+/// Buffers of one thread.
+pub struct Sampler {
+    weights: Vec<f32>,
+}
+
+impl Default for Sampler {
+    fn default() -> Self {
+        Self { weights: vec![0.0; MAX_STEPS] }
+    }
+}
+
+impl Sampler {
+    /// Writes `count + 1` increasing distances to `edges`; false if the ray misses the box.
+    ///
+    /// `grid_sigma(p, t)` is the sum of the streams' running densities. `jitter` in [0, 1) shifts all edges by a part of
+    /// one interval's weight.
+    #[inline(always)]
+    pub fn edges(
+        &mut self,
+        ray: &Ray,
+        sampling: &Sampling,
+        jitter: f32,
+        grid_sigma: impl Fn(Vec3, f32) -> f32,
+        edges: &mut [f32],
+    ) -> bool {
+        let (start, end) = ray.range;
+        if start >= end {
+            return false;
+        }
+        let steps = (((end - start) / sampling.step).ceil() as usize).clamp(1, MAX_STEPS);
+        let dt = (end - start) / steps as f32;
+        let mut left = 1.0f32;
+        let mut total = 0.0;
+        let mut used = 0;
+        let scale = sampling.sharpness * dt;
+        for w in &mut self.weights[..steps] {
+            let t = start + (used as f32 + 0.5) * dt;
+            let tau = grid_sigma(ray.origin + ray.dir * t, t) * scale;
+            let alpha = tau / (1.0 + tau); // 1 - e^-tau to first order, and cheaper; only steers the samples
+            *w = left * alpha;
+            total += *w;
+            left *= 1.0 - alpha;
+            used += 1;
+            if left < SATURATED {
+                break;
+            }
+        }
+        let span = used as f32;
+        let floor = sampling.explore * total.max(0.05) / ((1.0 - sampling.explore) * span);
+        let total = total + floor * span;
+        let n = sampling.count;
+        let (mut bin, mut below) = (0, 0.0);
+        edges[0] = start;
+        for (k, edge) in edges[1..n].iter_mut().enumerate() {
+            let target = (k as f32 + 0.5 + jitter) / n as f32 * total;
+            while bin + 1 < used && below + self.weights[bin] + floor < target {
+                below += self.weights[bin] + floor;
+                bin += 1;
+            }
+            let inside = ((target - below) / (self.weights[bin] + floor)).clamp(0.0, 1.0);
+            *edge = start + (bin as f32 + inside) * dt;
+        }
+        edges[n] = start + span * dt;
+        // Rounding may let two edges meet; intervals of zero length are harmless, decreasing ones are not.
+        for k in 1..=n {
+            edges[k] = edges[k].max(edges[k - 1]);
+        }
+        true
+    }
+}
+
+/// Share of the light that a grid cell must be able to stop, over one cell, for its stream to be evaluated there.
+pub const OCCUPIED_ALPHA: f32 = 0.01;
+
+/// Whether a stream may have density at `p`.
+#[inline(always)]
+pub fn occupied(grid: &DensityGrid, p: Vec3, threshold: f32) -> bool {
+    grid.at(p) > threshold
+}

@@ -1,0 +1,116 @@
+//! What the vector kernels share: aligned storage, the tile width, and transcendental functions that vectorise.
+//!
+//! Kernels are written once over [`pulp::Simd`]; `pulp` picks AVX-512, AVX2, NEON or plain scalar code at run time, so
+//! this crate needs no `unsafe`. Lanes are always samples, never features: every width gives the same forward result
+//! for every sample.
+
+use bytemuck::{Pod, Zeroable};
+
+/// Samples per tile: three AVX-512 vectors, six AVX2 vectors or twelve NEON vectors.
+///
+/// Three vectors times four outputs are the twelve independent accumulators that hide the latency of a fused
+/// multiply-add on two ports, and fit the sixteen registers of AVX2.
+pub const TILE: usize = 48;
+
+/// One cache line of floats; gives [`AlignedVec`] its alignment.
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C, align(64))]
+struct Line([f32; 16]);
+
+/// A float buffer that starts on a cache line, so that no vector load straddles two.
+#[derive(Clone, Default)]
+pub struct AlignedVec {
+    lines: Vec<Line>,
+    len: usize,
+}
+
+impl AlignedVec {
+    /// `len` zeros.
+    pub fn zeros(len: usize) -> Self {
+        Self { lines: vec![Line([0.0; 16]); len.div_ceil(16)], len }
+    }
+
+    /// Grows to at least `len` floats; contents are unspecified afterwards.
+    pub fn reserve_len(&mut self, len: usize) {
+        if len > self.len {
+            *self = Self::zeros(len);
+        }
+    }
+}
+
+impl std::ops::Deref for AlignedVec {
+    type Target = [f32];
+    fn deref(&self) -> &[f32] {
+        &bytemuck::cast_slice(&self.lines)[..self.len]
+    }
+}
+
+impl std::ops::DerefMut for AlignedVec {
+    fn deref_mut(&mut self) -> &mut [f32] {
+        &mut bytemuck::cast_slice_mut(&mut self.lines)[..self.len]
+    }
+}
+
+/// e^x to 2 ulp for x in [-87, 88], clamped outside; branch-free so that loops over it vectorise.
+///
+/// Cody–Waite reduction to |r| ≤ ln2/2, degree-6 polynomial, exponent by bit arithmetic.
+#[inline(always)]
+pub fn exp(x: f32) -> f32 {
+    const LN2_HI: f32 = 0.693_359_4;
+    const LN2_LO: f32 = -2.121_944_4e-4;
+    // 1.5 * 2^23: adding it rounds to the nearest integer and leaves that integer in the low mantissa bits.
+    const ROUND: f32 = 12_582_912.0;
+    let x = x.clamp(-87.0, 88.0);
+    let shifted = x * std::f32::consts::LOG2_E + ROUND;
+    let n = shifted - ROUND;
+    let r = (x - n * LN2_HI) - n * LN2_LO;
+    let p = 1.0 / 720.0;
+    let p = p * r + 1.0 / 120.0;
+    let p = p * r + 1.0 / 24.0;
+    let p = p * r + 1.0 / 6.0;
+    let p = p * r + 0.5;
+    let p = (p * r) * r + r + 1.0;
+    let exponent = (shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127)) << 23;
+    p * f32::from_bits(exponent)
+}
+
+/// 1 / (1 + e^-x).
+#[inline(always)]
+pub fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp(-x))
+}
+
+/// 1 - e^-x for x ≥ 0 without cancellation for thin samples.
+#[inline(always)]
+pub fn one_minus_exp_neg(x: f32) -> f32 {
+    // Below 0.25 the difference would lose two bits and more; the series' first neglected term is x^7/5040 < 2e-8 x.
+    let series =
+        x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0 - x * (1.0 / 120.0 - x * (1.0 / 720.0))))));
+    if x < 0.25 { series } else { 1.0 - exp(-x) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exp_is_within_2_ulp() {
+        for i in 0..200_000 {
+            let x = -86.0 + i as f32 * (173.0 / 200_000.0);
+            let truth = f64::from(x).exp();
+            let err = (f64::from(exp(x)) - truth).abs() / truth;
+            assert!(err < 2.5e-7, "exp({x}) is off by {err:e}");
+        }
+    }
+
+    #[test]
+    fn one_minus_exp_neg_is_relatively_exact() {
+        for i in 1..100_000 {
+            let x = (i as f32 * 1e-4).powi(3);
+            let truth = -(-f64::from(x)).exp_m1();
+            let err = (f64::from(one_minus_exp_neg(x)) - truth).abs() / truth;
+            assert!(err < 5e-7, "1 - exp(-{x}) is off by {err:e}");
+        }
+        assert_eq!(one_minus_exp_neg(0.0), 0.0);
+    }
+}
