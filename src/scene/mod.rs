@@ -1,11 +1,30 @@
 //! What comes in: posed video frames, one [`Scene`] type whatever the file format.
 
+mod assemble;
+mod bounds;
 mod camera;
+mod colmap;
+mod colmap_bin;
+mod colmap_txt;
+mod draft;
+mod epic_diff;
+mod epic_fields;
+mod error;
+mod header;
+mod image;
+mod json;
+mod open;
+mod ply_points;
+mod pose;
+mod timeline;
+mod transforms;
 
 use std::path::PathBuf;
 
 pub use camera::{Camera, Pose};
+pub use error::{Place, SceneError};
 use glam::DVec3;
+pub use image::RgbImage;
 
 /// Which part of the protocol a frame belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
