@@ -1,2 +1,1 @@
-//! bench
-fn main() { divff::bench_mlp() }
+fn main() { divff::train::trainer::experiment() }

@@ -5,15 +5,15 @@
 //! hash. Levels are separate so that gradients can be scattered by one task a level, without atomics and in a fixed
 //! order.
 
-use glam::Vec3;
+use glam::{Vec3, Vec4};
 
 use crate::simd::TILE;
 
 /// Features per level: one 16-byte row.
 pub const FEATURES: usize = 4;
 
-/// One table row.
-pub type Row = [f32; FEATURES];
+/// One table row; a `Vec4` rather than an array because the compiler keeps it in one vector register.
+pub type Row = Vec4;
 
 /// The lattice of one level.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -30,10 +30,12 @@ pub struct Level {
     pub dense: bool,
 }
 
-/// The eight rows around a point and the point's place between them.
+/// The eight rows around each point of a tile and the points' places between them.
 struct Corners {
-    rows: [u32; 8],
-    frac: Vec3,
+    /// `[corner][lane]`, x fastest.
+    rows: [[u32; TILE]; 8],
+    /// `[axis][lane]`, 0–1.
+    frac: [[f32; TILE]; 3],
 }
 
 /// Shape of a grid over the box `[0, extent]`.
@@ -69,12 +71,13 @@ impl HashGrid {
             let (o0, rest) = out.split_at_mut(TILE);
             let (o1, rest) = rest.split_at_mut(TILE);
             let (o2, o3) = rest.split_at_mut(TILE);
+            let corners = level.corners(pos);
             for s in 0..TILE {
-                let row = level.interpolate(table, Vec3::new(pos[0][s], pos[1][s], pos[2][s]));
-                o0[s] = row[0];
-                o1[s] = row[1];
-                o2[s] = row[2];
-                o3[s] = row[3];
+                let row = corners.interpolate(table, s);
+                o0[s] = row.x;
+                o1[s] = row.y;
+                o2[s] = row.z;
+                o3[s] = row.w;
             }
         }
     }
@@ -84,8 +87,8 @@ impl HashGrid {
     pub fn position_gradient(&self, tables: &[Vec<Row>], pos: Vec3, grad: &[f32], s: usize) -> Vec3 {
         let mut out = Vec3::ZERO;
         for (n, (level, table)) in self.levels.iter().zip(tables).enumerate() {
-            let g: Row = std::array::from_fn(|f| grad[(n * FEATURES + f) * TILE + s]);
-            out += level.position_gradient(table, pos, g);
+            let g = |f: usize| grad[(n * FEATURES + f) * TILE + s];
+            out += level.position_gradient(table, pos, Row::new(g(0), g(1), g(2), g(3)));
         }
         out
     }
@@ -107,67 +110,61 @@ impl Level {
     }
 
     #[inline(always)]
-    fn corners(&self, p: Vec3) -> Corners {
-        let q = p * self.scale;
-        // `as u32` saturates: a point below the box (or NaN) lands in cell 0, one above in the last cell.
-        let cell = [
-            (q.x as u32).min(self.last_cell[0]),
-            (q.y as u32).min(self.last_cell[1]),
-            (q.z as u32).min(self.last_cell[2]),
-        ];
-        let frac = (q - Vec3::new(cell[0] as f32, cell[1] as f32, cell[2] as f32)).clamp(Vec3::ZERO, Vec3::ONE);
-        let y0 = cell[1].wrapping_mul(self.stride[1]);
-        let y1 = y0.wrapping_add(self.stride[1]);
-        let z0 = cell[2].wrapping_mul(self.stride[2]);
-        let z1 = z0.wrapping_add(self.stride[2]);
-        let (x0, x1) = (cell[0], cell[0] + 1);
-        let rows = if self.dense {
-            let (a, b, c, d) = (y0 + z0, y1 + z0, y0 + z1, y1 + z1);
-            [x0 + a, x1 + a, x0 + b, x1 + b, x0 + c, x1 + c, x0 + d, x1 + d]
-        } else {
-            let mask = self.rows as u32 - 1;
-            let (a, b, c, d) = (y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1);
-            [x0 ^ a, x1 ^ a, x0 ^ b, x1 ^ b, x0 ^ c, x1 ^ c, x0 ^ d, x1 ^ d].map(|r| r & mask)
-        };
+    fn corners(&self, pos: &[[f32; TILE]; 3]) -> Corners {
+        let mut cell = [[0u32; TILE]; 3];
+        let mut frac = [[0.0f32; TILE]; 3];
+        for axis in 0..3 {
+            let (scale, last) = (self.scale[axis], self.last_cell[axis] as i32);
+            for s in 0..TILE {
+                let q = pos[axis][s] * scale;
+                // `as i32` saturates: a point outside the box (or NaN) lands in the nearest cell (or the first).
+                let c = (q as i32).clamp(0, last);
+                cell[axis][s] = c as u32;
+                frac[axis][s] = (q - c as f32).clamp(0.0, 1.0);
+            }
+        }
+        let mut rows = [[0u32; TILE]; 8];
+        let mask = self.rows as u32 - 1;
+        for s in 0..TILE {
+            let (x0, x1) = (cell[0][s], cell[0][s] + 1);
+            let y0 = cell[1][s].wrapping_mul(self.stride[1]);
+            let y1 = y0.wrapping_add(self.stride[1]);
+            let z0 = cell[2][s].wrapping_mul(self.stride[2]);
+            let z1 = z0.wrapping_add(self.stride[2]);
+            for (n, (y, z)) in [(y0, z0), (y1, z0), (y0, z1), (y1, z1)].into_iter().enumerate() {
+                if self.dense {
+                    rows[2 * n][s] = x0 + y + z;
+                    rows[2 * n + 1][s] = x1 + y + z;
+                } else {
+                    rows[2 * n][s] = (x0 ^ y ^ z) & mask;
+                    rows[2 * n + 1][s] = (x1 ^ y ^ z) & mask;
+                }
+            }
+        }
         Corners { rows, frac }
     }
 
+    /// Adds the gradients `g` of a tile's features to the rows around its points `pos`, by the weights with which
+    /// they were read.
     #[inline(always)]
-    fn interpolate(&self, table: &[Row], p: Vec3) -> Row {
-        let c = self.corners(p);
-        let v = c.rows.map(|r| table[r as usize]);
-        let x00 = lerp(v[0], v[1], c.frac.x);
-        let x10 = lerp(v[2], v[3], c.frac.x);
-        let x01 = lerp(v[4], v[5], c.frac.x);
-        let x11 = lerp(v[6], v[7], c.frac.x);
-        lerp(lerp(x00, x10, c.frac.y), lerp(x01, x11, c.frac.y), c.frac.z)
-    }
-
-    /// Adds `g` to the gradient rows around `p`, by the weights with which [`Self::interpolate`] read them.
-    #[inline(always)]
-    pub fn scatter(&self, grads: &mut [Row], p: Vec3, g: Row) {
-        let c = self.corners(p);
-        let (fx, fy, fz) = (c.frac.x, c.frac.y, c.frac.z);
-        let (y0z0, y1z0) = ((1.0 - fy) * (1.0 - fz), fy * (1.0 - fz));
-        let (y0z1, y1z1) = ((1.0 - fy) * fz, fy * fz);
-        for (n, yz) in [y0z0, y1z0, y0z1, y1z1].into_iter().enumerate() {
-            for (row, w) in [(c.rows[2 * n], (1.0 - fx) * yz), (c.rows[2 * n + 1], fx * yz)] {
-                let row = &mut grads[row as usize];
-                for f in 0..FEATURES {
-                    row[f] += w * g[f];
-                }
+    pub fn scatter(&self, grads: &mut [Row], pos: &[[f32; TILE]; 3], g: &[Row]) {
+        let c = self.corners(pos);
+        for (s, g) in g.iter().enumerate() {
+            let (fx, fy, fz) = (c.frac[0][s], c.frac[1][s], c.frac[2][s]);
+            let (g1, g0) = (*g * fz, *g * (1.0 - fz));
+            let (g11, g10, g01, g00) = (g1 * fy, g0 * fy, g1 * (1.0 - fy), g0 * (1.0 - fy));
+            for (n, g) in [g00, g10, g01, g11].into_iter().enumerate() {
+                grads[c.rows[2 * n][s] as usize] += g * (1.0 - fx);
+                grads[c.rows[2 * n + 1][s] as usize] += g * fx;
             }
         }
     }
 
     fn position_gradient(&self, table: &[Row], p: Vec3, g: Row) -> Vec3 {
-        let c = self.corners(p);
-        let v = c.rows.map(|r| {
-            let row = table[r as usize];
-            row[0] * g[0] + row[1] * g[1] + row[2] * g[2] + row[3] * g[3]
-        });
+        let c = self.corners(&[[p.x; TILE], [p.y; TILE], [p.z; TILE]]);
+        let v = c.rows.map(|r| table[r[0] as usize].dot(g));
         let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
-        let (x, y, z) = (c.frac.x, c.frac.y, c.frac.z);
+        let [x, y, z] = c.frac.map(|f| f[0]);
         let dx = mix(mix(v[1] - v[0], v[3] - v[2], y), mix(v[5] - v[4], v[7] - v[6], y), z);
         let dy = mix(mix(v[2] - v[0], v[3] - v[1], x), mix(v[6] - v[4], v[7] - v[5], x), z);
         let dz = mix(mix(v[4] - v[0], v[5] - v[1], x), mix(v[6] - v[2], v[7] - v[3], x), y);
@@ -175,7 +172,18 @@ impl Level {
     }
 }
 
-#[inline(always)]
-fn lerp(a: Row, b: Row, t: f32) -> Row {
-    std::array::from_fn(|f| a[f] + (b[f] - a[f]) * t)
+impl Corners {
+    #[inline(always)]
+    fn interpolate(&self, table: &[Row], s: usize) -> Row {
+        let row = |n: usize| table[self.rows[n][s] as usize];
+        let [fx, fy, fz] = [self.frac[0][s], self.frac[1][s], self.frac[2][s]];
+        let along_x = |n: usize| {
+            let (a, b) = (row(n), row(n + 1));
+            a + (b - a) * fx
+        };
+        let (a, b) = (along_x(0), along_x(2));
+        let (c, d) = (along_x(4), along_x(6));
+        let (e, f) = (a + (b - a) * fy, c + (d - c) * fy);
+        e + (f - e) * fz
+    }
 }

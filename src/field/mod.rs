@@ -184,7 +184,7 @@ impl Field {
                 *w = 0.1 * (2.0 * rng.uniform() - 1.0);
             }
             for row in self.tables[s as usize].iter_mut().flatten() {
-                *row = std::array::from_fn(|_| 1e-2 * (2.0 * rng.uniform() - 1.0));
+                *row = Row::from_array(std::array::from_fn(|_| 1e-2 * (2.0 * rng.uniform() - 1.0)));
             }
         }
     }
@@ -225,7 +225,7 @@ impl Layout {
 }
 
 fn empty_tables(net: &StreamNet) -> Vec<Vec<Row>> {
-    net.grid.levels.iter().map(|l| vec![[0.0; hashgrid::FEATURES]; l.rows]).collect()
+    net.grid.levels.iter().map(|l| vec![Row::ZERO; l.rows]).collect()
 }
 
 /// Real spherical harmonics of degree 1 and 2 of a unit direction, without their constants' signs.

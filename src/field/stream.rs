@@ -110,6 +110,11 @@ impl StreamBatch {
         self.sample.is_empty()
     }
 
+    /// Positions tile by tile, `[axis][lane]`.
+    pub fn tiles(&self) -> &[[[f32; TILE]; 3]] {
+        &self.pos
+    }
+
     /// Position of lane `n`.
     #[inline(always)]
     pub fn position(&self, n: usize) -> Vec3 {
@@ -266,7 +271,7 @@ impl StreamNet {
             for (n, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
                 let g = &batch.grads[n * stride + level * FEATURES * TILE..][..FEATURES * TILE];
                 for (lane, row) in out.iter_mut().enumerate() {
-                    *row = [g[lane], g[TILE + lane], g[2 * TILE + lane], g[3 * TILE + lane]];
+                    *row = Row::new(g[lane], g[TILE + lane], g[2 * TILE + lane], g[3 * TILE + lane]);
                 }
             }
         }

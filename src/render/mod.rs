@@ -4,3 +4,5 @@ pub mod composite;
 pub mod density_grid;
 pub mod rays;
 pub mod sampler;
+pub mod forward;
+pub mod image;

@@ -1,0 +1,222 @@
+//! The forward pass of a chunk of rays: sample, evaluate each stream where it may have density, composite.
+//!
+//! Training and rendering both go through here; training then walks the same buffers backwards.
+
+use glam::{Vec2, Vec3};
+use pulp::Simd;
+
+use super::composite::{self, Interval, Weighted};
+use super::density_grid::DensityGrid;
+use super::rays::{Ray, View};
+use super::sampler::{Sampler, Sampling, occupied};
+use crate::field::mlp::Packed;
+use crate::field::stream::{StreamBatch, StreamSamples, StreamWeights};
+use crate::field::{Field, Stream, VIEW, view_encoding};
+
+/// Running densities of the three streams. The actor's is over (u, v, inverse depth) in the camera's frustum.
+#[derive(Clone, Debug)]
+pub struct Grids {
+    /// One grid per stream.
+    pub streams: [DensityGrid; 3],
+    /// σ above which a stream is evaluated in a cell, 1/unit.
+    pub threshold: [f32; 3],
+}
+
+/// A field ready to be evaluated: packed weights and the grids that tell where it is worth it.
+pub struct Model<'a> {
+    /// Shape and tables.
+    pub field: &'a Field,
+    /// Trunk and head of each stream.
+    packed: [Option<(Packed, Packed)>; 3],
+    /// Running densities.
+    pub grids: &'a Grids,
+    /// Streams that take part.
+    pub streams: [bool; 3],
+}
+
+impl<'a> Model<'a> {
+    /// Packs the weights of the streams that the field has and that `streams` asks for.
+    pub fn new(field: &'a Field, grids: &'a Grids, streams: [bool; 3]) -> Self {
+        let packed = Stream::ALL.map(|s| {
+            let net = field.net(s)?;
+            let r = &field.layout.streams[s as usize];
+            Some((net.trunk.pack(&field.weights[r.trunk.clone()]), net.head.pack(&field.weights[r.head.clone()])))
+        });
+        let streams = std::array::from_fn(|s| streams[s] && field.nets[s].is_some());
+        Self { field, packed, grids, streams }
+    }
+
+    /// What the kernels of one stream read.
+    pub fn weights(&self, s: usize) -> Option<StreamWeights<'_>> {
+        let (trunk, head) = self.packed[s].as_ref()?;
+        Some(StreamWeights { tables: &self.field.tables[s], trunk, head })
+    }
+
+    /// Actor coordinates of a point at z-depth `z` seen at image fraction `uv`: inverse depth as third coordinate.
+    #[inline(always)]
+    pub fn actor_point(&self, uv: Vec2, z: f32) -> Vec3 {
+        let (near, far) = (self.field.near * 0.5, self.field.actor_far);
+        uv.extend(((1.0 - near / z.max(near)) / (1.0 - near / far)).min(1.0))
+    }
+}
+
+/// A ray to be traced.
+#[derive(Clone, Copy, Debug)]
+pub struct RayInput {
+    /// Which of the views it belongs to.
+    pub view: u32,
+    /// Unit direction in camera axes.
+    pub dir_cam: Vec3,
+    /// Pixel centre as a fraction of the image.
+    pub uv: Vec2,
+    /// Random (training) or 0.5 (rendering): shifts the samples.
+    pub jitter: f32,
+}
+
+/// What is known about one ray of the chunk.
+#[derive(Clone, Copy, Debug)]
+pub struct TracedRay {
+    /// Its geometry.
+    pub ray: Ray,
+    /// Light left behind the last interval.
+    pub left: f32,
+    /// Σ w c over streams and intervals, before background and exposure.
+    pub rgb: [f32; 3],
+    /// Σ w^d β^d + w^a β^a.
+    pub beta: f32,
+    /// Spherical harmonics of the viewing direction.
+    view: [f32; VIEW],
+}
+
+/// Buffers of one chunk; everything that the backward pass needs again.
+#[derive(Default)]
+pub struct Chunk {
+    sampler: Sampler,
+    edges: Vec<f32>,
+    codes: [Vec<f32>; 3],
+    /// The rays in order.
+    pub rays: Vec<TracedRay>,
+    /// `[rays * count]`.
+    pub intervals: Vec<Interval>,
+    /// `[rays * count]`.
+    pub weighted: Vec<Weighted>,
+    /// Which samples each stream was evaluated at.
+    pub batches: [StreamBatch; 3],
+    /// What each stream said; zero where it was not evaluated.
+    pub samples: [StreamSamples; 3],
+}
+
+impl Chunk {
+    /// Traces `inputs` and fills all buffers.
+    #[inline(always)]
+    pub fn forward<S: Simd>(
+        &mut self,
+        simd: S,
+        model: &Model,
+        views: &[View],
+        inputs: &[RayInput],
+        sampling: &Sampling,
+    ) {
+        let n = sampling.count;
+        self.place_samples(model, views, inputs, sampling);
+        let Self { codes, rays, intervals, weighted, batches, samples, .. } = self;
+        for s in 0..3 {
+            samples[s].reset(intervals.len());
+            let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
+            if batches[s].is_empty() {
+                continue;
+            }
+            let code = |k: u32| &codes[s][k as usize / n * net.code..];
+            let view = |k: u32| &rays[k as usize / n].view[..];
+            net.forward(simd, &w, &mut batches[s], code, view, &mut samples[s]);
+            for (i, sigma) in intervals.iter_mut().zip(&samples[s].sigma) {
+                i.sigma[s] = *sigma;
+            }
+        }
+        weighted.resize(intervals.len(), Weighted::default());
+        for (r, ray) in rays.iter_mut().enumerate() {
+            let range = r * n..(r + 1) * n;
+            ray.left = composite::weights(&intervals[range.clone()], &mut weighted[range.clone()]);
+            ray.rgb = [0.0; 3];
+            ray.beta = 0.0;
+            for k in range {
+                for s in 0..3 {
+                    let w = weighted[k].weight[s];
+                    for c in 0..3 {
+                        ray.rgb[c] += w * samples[s].rgb[k][c];
+                    }
+                    if s > 0 {
+                        ray.beta += w * samples[s].beta[k];
+                    }
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn place_samples(&mut self, model: &Model, views: &[View], inputs: &[RayInput], sampling: &Sampling) {
+        let n = sampling.count;
+        let field = model.field;
+        let [grid_p, grid_d, grid_a] = &model.grids.streams;
+        self.rays.clear();
+        self.intervals.clear();
+        self.edges.resize(n + 1, 0.0);
+        for b in &mut self.batches {
+            b.clear();
+        }
+        for s in 0..3 {
+            let width = field.nets[s].as_ref().map_or(0, |net| net.code);
+            self.codes[s].resize(inputs.len() * width, 0.0);
+        }
+        for (r, input) in inputs.iter().enumerate() {
+            let view = &views[input.view as usize];
+            let ray = view.ray(input.dir_cam, field.normalisation.extent, field.near);
+            for s in 1..3 {
+                if let (Some(code), Some(at)) = (&field.codes[s], view.code_knots[s]) {
+                    let gamma = &field.weights[field.layout.streams[s].code.clone()];
+                    code.evaluate(gamma, at, &mut self.codes[s][r * code.width..(r + 1) * code.width]);
+                }
+            }
+            let sigma = |p: Vec3, t: f32| {
+                let mut sum = 0.0;
+                if model.streams[0] {
+                    sum += grid_p.at(p);
+                }
+                if model.streams[1] {
+                    sum += grid_d.at(p);
+                }
+                let z = t * input.dir_cam.z;
+                if model.streams[2] && z < field.actor_far {
+                    sum += grid_a.at(model.actor_point(input.uv, z));
+                }
+                sum
+            };
+            let hit = self.sampler.edges(&ray, sampling, input.jitter, sigma, &mut self.edges);
+            for k in 0..n {
+                let sample = r * n + k;
+                if !hit {
+                    self.intervals.push(Interval::default());
+                    continue;
+                }
+                let t = 0.5 * (self.edges[k] + self.edges[k + 1]);
+                let delta = self.edges[k + 1] - self.edges[k];
+                self.intervals.push(Interval { sigma: [0.0; 3], delta, t });
+                let p = ray.origin + ray.dir * t;
+                for (s, grid) in [grid_p, grid_d].into_iter().enumerate() {
+                    if model.streams[s] && occupied(grid, p, model.grids.threshold[s]) {
+                        self.batches[s].push(sample, p);
+                    }
+                }
+                let z = t * input.dir_cam.z;
+                if model.streams[2] && z < field.actor_far {
+                    let q = model.actor_point(input.uv, z);
+                    if occupied(grid_a, q, model.grids.threshold[2]) {
+                        self.batches[2].push(sample, q);
+                    }
+                }
+            }
+            let unit = ray.dir.normalize_or_zero();
+            self.rays.push(TracedRay { ray, left: 1.0, rgb: [0.0; 3], beta: 0.0, view: view_encoding(unit) });
+        }
+    }
+}

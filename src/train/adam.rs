@@ -1,0 +1,87 @@
+//! Adam (Kingma & Ba 2015) over flat weights and over hash-table rows.
+
+use crate::field::hashgrid::Row;
+
+/// Decay rates and the guard against division by zero; instant-ngp's values.
+const BETA1: f32 = 0.9;
+const BETA2: f32 = 0.99;
+const EPSILON: f32 = 1e-15;
+
+/// First and second moments of a flat weight vector.
+#[derive(Clone, Debug)]
+pub struct Moments {
+    /// Running mean of the gradient.
+    pub first: Vec<f32>,
+    /// Running mean of its square.
+    pub second: Vec<f32>,
+}
+
+impl Moments {
+    /// Zeros.
+    pub fn new(n: usize) -> Self {
+        Self { first: vec![0.0; n], second: vec![0.0; n] }
+    }
+}
+
+/// Step sizes with the bias corrections of step `step` (from 1) folded in.
+#[derive(Clone, Copy, Debug)]
+pub struct StepSize {
+    rate: f32,
+    correction: f32,
+}
+
+impl StepSize {
+    /// The learning rate `rate` at step `step` (from 1).
+    pub fn new(rate: f32, step: u64) -> Self {
+        let step = step.min(i32::MAX as u64) as i32;
+        let rate = f64::from(rate) / (1.0 - f64::from(BETA1).powi(step));
+        let correction = 1.0 / (1.0 - f64::from(BETA2).powi(step));
+        Self { rate: rate as f32, correction: correction as f32 }
+    }
+}
+
+/// One update of a range of flat weights.
+pub fn update(weights: &mut [f32], grads: &[f32], first: &mut [f32], second: &mut [f32], step: StepSize) {
+    for (((w, g), m), v) in weights.iter_mut().zip(grads).zip(first).zip(second) {
+        *m += (1.0 - BETA1) * (g - *m);
+        *v += (1.0 - BETA2) * (g * g - *v);
+        *w -= step.rate * *m / ((*v * step.correction).sqrt() + EPSILON);
+    }
+}
+
+/// State of one hash table during training.
+#[derive(Clone, Debug)]
+pub struct TableState {
+    /// Gradient of this step; zero between steps.
+    pub grad: Vec<Row>,
+    /// Running mean of the gradient.
+    pub first: Vec<Row>,
+    /// Running mean of its square.
+    pub second: Vec<Row>,
+}
+
+impl TableState {
+    /// Zeros for `rows` rows.
+    pub fn new(rows: usize) -> Self {
+        let zeros = vec![Row::ZERO; rows];
+        Self { grad: zeros.clone(), first: zeros.clone(), second: zeros }
+    }
+
+    /// Updates what was touched in this step and clears the gradients.
+    ///
+    /// Numbers without a gradient keep their moments: they were not seen, which is no evidence.
+    #[inline(always)]
+    pub fn update(&mut self, table: &mut [Row], step: StepSize) {
+        let [w, g, m, v] = [table, &mut self.grad, &mut self.first, &mut self.second]
+            .map(|rows| bytemuck::cast_slice_mut::<Row, f32>(rows));
+        for (((w, g), m), v) in w.iter_mut().zip(g).zip(m).zip(v) {
+            let (m1, v1) = (*m + (1.0 - BETA1) * (*g - *m), *v + (1.0 - BETA2) * (*g * *g - *v));
+            let w1 = *w - step.rate * m1 / ((v1 * step.correction).sqrt() + EPSILON);
+            let touched = *g != 0.0;
+            *w = if touched { w1 } else { *w };
+            *m = if touched { m1 } else { *m };
+            *v = if touched { v1 } else { *v };
+            *g = 0.0;
+        }
+    }
+}

@@ -1,0 +1,67 @@
+//! The training pixels, in memory.
+
+use rayon::prelude::*;
+
+use crate::render::rays::{PixelDirections, pixel_directions};
+use crate::scene::{Camera, Frame, SceneError};
+
+/// Frames with their pixels and the directions of their cameras' pixels.
+pub struct PixelSet {
+    /// The frames.
+    pub frames: Vec<Frame>,
+    /// sRGB, row-major, per frame.
+    pub images: Vec<Vec<[u8; 3]>>,
+    /// Indices of usable pixels where a frame has a mask.
+    usable: Vec<Option<Vec<u32>>>,
+    cameras: Vec<(Camera, PixelDirections)>,
+    camera_of: Vec<usize>,
+}
+
+impl PixelSet {
+    /// Loads all pixels and masks of `frames`.
+    ///
+    /// # Errors
+    /// A file that cannot be read or does not fit its frame.
+    pub fn load(frames: Vec<Frame>) -> Result<Self, SceneError> {
+        let loaded: Vec<_> = frames
+            .par_iter()
+            .map(|f| {
+                let usable = f.load_mask()?.map(|mask| {
+                    mask.iter().enumerate().filter(|(_, m)| **m).map(|(n, _)| n as u32).collect::<Vec<_>>()
+                });
+                Ok((f.load_rgb()?.pixels, usable))
+            })
+            .collect::<Result<_, SceneError>>()?;
+        let (images, usable) = loaded.into_iter().unzip();
+        let mut cameras: Vec<(Camera, PixelDirections)> = Vec::new();
+        let camera_of = frames
+            .iter()
+            .map(|f| {
+                cameras.iter().position(|(c, _)| *c == f.camera).unwrap_or_else(|| {
+                    cameras.push((f.camera, pixel_directions(&f.camera)));
+                    cameras.len() - 1
+                })
+            })
+            .collect();
+        Ok(Self { frames, images, usable, cameras, camera_of })
+    }
+
+    /// Directions of all pixels of frame `n` in camera axes.
+    pub fn directions(&self, n: usize) -> &[glam::Vec3] {
+        &self.cameras[self.camera_of[n]].1
+    }
+
+    /// Whether the mask of frame `n` leaves pixel number `pixel`.
+    pub fn is_usable(&self, n: usize, pixel: u32) -> bool {
+        self.usable[n].as_ref().is_none_or(|list| list.binary_search(&pixel).is_ok())
+    }
+
+    /// A usable pixel of frame `n`, chosen by `u` in [0, 1); `None` where the mask leaves none.
+    pub fn pick(&self, n: usize, u: f32) -> Option<usize> {
+        match &self.usable[n] {
+            None => Some(((u * self.images[n].len() as f32) as usize).min(self.images[n].len() - 1)),
+            Some(list) if list.is_empty() => None,
+            Some(list) => Some(list[((u * list.len() as f32) as usize).min(list.len() - 1)] as usize),
+        }
+    }
+}
