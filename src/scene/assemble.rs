@@ -40,6 +40,12 @@ pub(crate) fn assemble(mut draft: Draft) -> Result<Scene, SceneError> {
     }
     check_stems(&draft.source, &frames)?;
     seen.report(&mut warnings);
+    let listed = draft.points.len();
+    draft.points.retain(|p| p.is_finite());
+    if draft.points.len() < listed {
+        warnings
+            .push(format!("{} sparse points are not finite and are left out", listed - draft.points.len()));
+    }
     let bounds = bounds::find(&draft, &frames, &mut warnings)?;
     Ok(Scene {
         root: draft.root,

@@ -84,7 +84,8 @@ fn from_cameras(frames: &[Frame], reach: Option<f64>, warnings: &mut Vec<String>
         seen.push(frame.c2w.translation);
         let (w, h) = (f64::from(frame.camera.width), f64::from(frame.camera.height));
         for (x, y) in [(0.5, 0.5), (0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
-            let dir = frame.camera.unproject(DVec2::new(x * w, y * h));
+            // At one distance, not one depth: corners of wide lenses would reach far too far.
+            let dir = frame.camera.unproject(DVec2::new(x * w, y * h)).normalize();
             seen.push(frame.c2w.transform_point3(dir * reach));
         }
     }
@@ -95,7 +96,7 @@ fn from_cameras(frames: &[Frame], reach: Option<f64>, warnings: &mut Vec<String>
     bounds
 }
 
-/// How far from the cameras things probably are, along the optical axes.
+/// How far from the cameras things probably are.
 ///
 /// Cameras that circle something look at one point: twice its distance covers what is behind it. Cameras that walk
 /// through a room have no such point: things are about as far off as the cameras get around.

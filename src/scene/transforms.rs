@@ -165,7 +165,13 @@ fn read_aabb(top: &Fields) -> Result<Option<Aabb>, SceneError> {
     let (min, max) = corners.ok_or_else(|| {
         top.invalid("aabb", "expected [[x, y, z], [x, y, z]] with finite numbers", "correct or remove it")
     })?;
-    Ok(Some(Aabb { min: DVec3::from(min), max: DVec3::from(max) }))
+    let aabb = Aabb { min: DVec3::from(min), max: DVec3::from(max) };
+    // Here and not only after `applied_transform` is undone: that sorts the corners.
+    if !aabb.min.cmplt(aabb.max).all() {
+        let what = format!("the box from {} to {} is empty", aabb.min, aabb.max);
+        return Err(top.invalid("aabb", what, "give the smallest corner first, then the largest"));
+    }
+    Ok(Some(aabb))
 }
 
 /// The way from the file's coordinates back to those of the original reconstruction.
