@@ -109,7 +109,8 @@ impl Oddities {
         }
         if let Some((count, first)) = self.turned {
             warnings.push(format!(
-                "{count} images have an EXIF orientation ({first}); it is ignored, as structure from motion does"
+                "{count} images have an EXIF orientation (first: {first}); poses are taken to be of the pixels \
+                 as stored"
             ));
         }
     }

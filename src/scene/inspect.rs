@@ -18,7 +18,8 @@ const FOLDERS: [(&str, bool); 6] = [
     ("text", false),
     ("gt", false),
 ];
-/// A camera that moves this many times the median step, and a good part of the whole way, has probably jumped.
+/// A camera that moves this many times the median step, and a good part of the whole way, has probably
+/// jumped.
 const JUMP: f64 = 20.0;
 
 /// Summary of a scene; what `divff inspect` prints.

@@ -8,10 +8,12 @@ use super::{Scene, assemble, colmap, draft::Draft, epic_diff, epic_fields, json,
 impl Scene {
     /// Opens a scene.
     ///
-    /// `path` is a folder with `transforms.json` (nerfstudio), `meta.json` (EPIC-Diff), a COLMAP model (`sparse/0` and
-    /// the like) or one EPIC-Fields JSON, looked for in this order; or one of these JSON files itself.
+    /// `path` is a folder with `transforms.json` (nerfstudio), `meta.json` (EPIC-Diff), a COLMAP model
+    /// (`sparse/0` and the like) or one EPIC-Fields JSON, looked for in this order; or one of these JSON
+    /// files itself.
     ///
-    /// Only lists and image headers are read; pixels are decoded when [`super::Frame::load_rgb`] asks for them.
+    /// Only lists and image headers are read; pixels are decoded when [`super::Frame::load_rgb`] asks for
+    /// them.
     ///
     /// # Errors
     /// [`SceneError`], naming the file, the frame and the key, line or byte at fault, and what to do.
@@ -20,7 +22,8 @@ impl Scene {
     }
 }
 
-fn read(path: &Path) -> Result<Draft, SceneError> {
+/// What the file of a scene lists, before it is checked.
+pub(super) fn read(path: &Path) -> Result<Draft, SceneError> {
     if path.is_file() {
         return read_json(path);
     }
@@ -74,8 +77,8 @@ fn read_json(file: &Path) -> Result<Draft, SceneError> {
         Err(SceneError::invalid(
             file,
             Place::File,
-            "it is none of the known formats (no `frames`; no `poses`, `images` and `intrinsics`; no `camera` and \
-             `images`)",
+            "it is none of the known formats (no `frames`; no `poses`, `images` and `intrinsics`; no \
+             `camera` and `images`)",
             "give a transforms.json, an EPIC-Diff meta.json or an EPIC-Fields file",
         ))
     }

@@ -1,8 +1,8 @@
 //! nerfstudio's `transforms.json`: the native format.
 //!
 //! Poses are camera-to-world with OpenGL camera axes. `applied_transform` (and `applied_scale`) lead from the
-//! coordinates of the original reconstruction to the ones saved in the file; they are undone for poses, `aabb` and
-//! sparse points, so that the scene keeps its original coordinates.
+//! coordinates of the original reconstruction to the ones saved in the file; they are undone for poses,
+//! `aabb` and sparse points, so that the scene keeps its original coordinates.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -241,8 +241,8 @@ impl Splits {
         Ok(Splits { train, test, val })
     }
 
-    /// The split of a frame. Held out wins over trained on, so that a test stays a test. Frames in none of the
-    /// lists are left out, except where one list alone says what the others are.
+    /// The split of a frame. Held out wins over trained on, so that a test stays a test. Frames in none of
+    /// the lists are left out, except where one list alone says what the others are.
     fn of(&self, file_path: &str) -> Option<ListedSplit> {
         let name = plain(file_path);
         let within = |set: &Option<BTreeSet<String>>| set.as_ref().is_some_and(|s| s.contains(&name));

@@ -13,7 +13,8 @@ use serde_json::{Value, json};
 
 use super::{Camera, Scene, SceneError};
 
-/// The camera of all test scenes: nothing in it is symmetric, so that no two numbers can be swapped unnoticed.
+/// The camera of all test scenes: nothing in it is symmetric, so that no two numbers can be swapped
+/// unnoticed.
 pub(super) const CAMERA: Camera =
     Camera { width: 12, height: 8, fx: 10.0, fy: 11.0, cx: 5.5, cy: 4.25, distortion: [0.0; 4] };
 

@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use super::super::{Scene, Split, inspect};
+use glam::{DVec2, DVec3};
+
+use super::super::{Aabb, Scene, Split, inspect};
 
 fn data(name: &str) -> Option<PathBuf> {
     let root = std::env::var_os("DIVFF_DATA").map(PathBuf::from);
@@ -32,26 +34,47 @@ fn shipped_scenes_open_with_their_splits() {
     }
 }
 
+/// Share of the depth pixels that lie in `bounds`.
+fn share_inside(scene: &Scene, bounds: &Aabb) -> f64 {
+    let (mut inside, mut all) = (0, 0);
+    for frame in scene.frames.iter().step_by(20) {
+        let depth = frame.load_depth(scene.depth_unit).unwrap().unwrap();
+        for (i, z) in depth.iter().enumerate().step_by(37).filter(|(_, z)| **z > 0.0) {
+            let (x, y) = (i as u32 % frame.camera.width, i as u32 / frame.camera.width);
+            let uv = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let p = frame.c2w.transform_point3(frame.camera.unproject(uv) * f64::from(*z));
+            inside += usize::from(bounds.contains(p));
+            all += 1;
+        }
+    }
+    f64::from(inside as u32) / f64::from(all)
+}
+
 #[test]
 fn depth_of_shipped_scenes_lies_in_their_bounds() {
     // Poses, axes, depth and box only fit together if every convention is right.
     for name in ["redkitchen", "kitchen-a"] {
         let Some(folder) = data(name) else { continue };
         let scene = Scene::open(&folder).unwrap();
-        let slack = glam::DVec3::splat(0.02);
-        let wider = super::super::Aabb { min: scene.bounds.min - slack, max: scene.bounds.max + slack };
-        let (mut inside, mut all) = (0, 0);
-        for frame in scene.frames.iter().step_by(20) {
-            let depth = frame.load_depth(scene.depth_unit).unwrap().unwrap();
-            for (i, z) in depth.iter().enumerate().step_by(37).filter(|(_, z)| **z > 0.0) {
-                let (x, y) = (i as u32 % frame.camera.width, i as u32 / frame.camera.width);
-                let uv = glam::DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                let p = frame.c2w.transform_point3(frame.camera.unproject(uv) * f64::from(*z));
-                inside += usize::from(wider.contains(p));
-                all += 1;
-            }
-        }
-        assert!(inside * 100 >= all * 97, "{name}: {inside} of {all} depth pixels are inside the box");
+        let slack = DVec3::splat(0.02);
+        let wider = Aabb { min: scene.bounds.min - slack, max: scene.bounds.max + slack };
+        let share = share_inside(&scene, &wider);
+        assert!(share >= 0.97, "{name}: {share} of the depth pixels are inside the box");
+    }
+}
+
+#[test]
+fn bounds_guessed_from_the_cameras_hold_what_they_see() {
+    for name in ["redkitchen", "kitchen-a"] {
+        let Some(folder) = data(name) else { continue };
+        let mut draft = super::super::open::read(&folder).unwrap();
+        let given = draft.aabb.take().unwrap();
+        let scene = super::super::assemble::assemble(draft).unwrap();
+        let share = share_inside(&scene, &scene.bounds);
+        let size = |b: &Aabb| (b.max - b.min).element_product().cbrt();
+        println!("{name}: {share} inside, {} times the size", size(&scene.bounds) / size(&given));
+        assert!(share >= 0.9, "{name}: {share} of the depth pixels are inside the guessed box");
+        assert!(size(&scene.bounds) < 3.0 * size(&given), "{name}: {:?}", scene.bounds);
     }
 }
 
