@@ -40,6 +40,12 @@ pub(crate) fn assemble(mut draft: Draft) -> Result<Scene, SceneError> {
     }
     check_stems(&draft.source, &frames)?;
     seen.report(&mut warnings);
+    let listed = draft.points.len();
+    draft.points.retain(|p| p.is_finite());
+    if draft.points.len() < listed {
+        warnings
+            .push(format!("{} sparse points are not finite and are left out", listed - draft.points.len()));
+    }
     let bounds = bounds::find(&draft, &frames, &mut warnings)?;
     Ok(Scene {
         root: draft.root,
@@ -103,7 +109,8 @@ impl Oddities {
         }
         if let Some((count, first)) = self.turned {
             warnings.push(format!(
-                "{count} images have an EXIF orientation ({first}); it is ignored, as structure from motion does"
+                "{count} images have an EXIF orientation (first: {first}); poses are taken to be of the pixels \
+                 as stored"
             ));
         }
     }

@@ -1,7 +1,7 @@
 //! The box that holds what is to be mapped.
 //!
-//! Given bounds are checked; without them the box comes from what is known: sparse points and cameras, or where
-//! the cameras look. Percentiles keep a few wrong points or poses from blowing the box up.
+//! Given bounds are checked; without them the box comes from what is known: sparse points and cameras, or
+//! where the cameras look. Percentiles keep a few wrong points or poses from blowing the box up.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -84,21 +84,22 @@ fn from_cameras(frames: &[Frame], reach: Option<f64>, warnings: &mut Vec<String>
         seen.push(frame.c2w.translation);
         let (w, h) = (f64::from(frame.camera.width), f64::from(frame.camera.height));
         for (x, y) in [(0.5, 0.5), (0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
-            let dir = frame.camera.unproject(DVec2::new(x * w, y * h));
+            // At one distance, not one depth: corners of wide lenses would reach far too far.
+            let dir = frame.camera.unproject(DVec2::new(x * w, y * h)).normalize();
             seen.push(frame.c2w.transform_point3(dir * reach));
         }
     }
     let bounds = widened(trimmed_box(seen));
     warnings.push(format!(
-        "the bounds were guessed from the cameras (reach {reach:.3}); give `aabb` if the map is cut off or coarse"
+        "the bounds were guessed from the cameras (reach {reach:.3}); give `aabb` if the map is cut off"
     ));
     bounds
 }
 
-/// How far from the cameras things probably are, along the optical axes.
+/// How far from the cameras things probably are.
 ///
-/// Cameras that circle something look at one point: twice its distance covers what is behind it. Cameras that walk
-/// through a room have no such point: things are about as far off as the cameras get around.
+/// Cameras that circle something look at one point: twice its distance covers what is behind it. Cameras that
+/// walk through a room have no such point: things are about as far off as the cameras get around.
 fn probable_reach(frames: &[Frame]) -> f64 {
     let positions: Vec<DVec3> = frames.iter().map(|f| f.c2w.translation).collect();
     let around = trimmed_box(positions);
@@ -153,7 +154,8 @@ fn widened(b: Aabb) -> Aabb {
     Aabb { min: b.min - pad, max: b.max + pad }
 }
 
-/// Whether a camera sees some part of the box: one of its rays hits it, or one of the box's points is in the image.
+/// Whether a camera sees some part of the box: one of its rays hits it, or one of the box's points is in the
+/// image.
 pub(crate) fn sees(frame: &Frame, bounds: &Aabb) -> bool {
     const STEPS: u32 = 8;
     let share = |i: u32| f64::from(i) / f64::from(STEPS);
@@ -184,9 +186,19 @@ pub(crate) fn sees(frame: &Frame, bounds: &Aabb) -> bool {
 
 /// Whether a ray that starts at `origin` meets the box (slab test).
 fn ray_hits(origin: DVec3, dir: DVec3, bounds: &Aabb) -> bool {
-    // A zero component gives infinities; 0·∞ = NaN, on a face, is dropped by min and max.
-    let (a, b) = ((bounds.min - origin) / dir, (bounds.max - origin) / dir);
-    let near = a.min(b).to_array().into_iter().fold(0.0, f64::max);
-    let far = a.max(b).to_array().into_iter().fold(f64::INFINITY, f64::min);
+    let (mut near, mut far) = (0.0_f64, f64::INFINITY);
+    for axis in 0..3 {
+        let (low, high) = (bounds.min[axis] - origin[axis], bounds.max[axis] - origin[axis]);
+        if dir[axis] == 0.0 {
+            // Along the slab: inside it or never in it. Dividing would give 0/0 on its faces.
+            if low > 0.0 || high < 0.0 {
+                return false;
+            }
+            continue;
+        }
+        let (a, b) = (low / dir[axis], high / dir[axis]);
+        near = near.max(a.min(b));
+        far = far.min(a.max(b));
+    }
     near <= far
 }

@@ -1,7 +1,7 @@
 //! COLMAP's sparse models: `cameras`, `images` and `points3D`, as `.bin` or `.txt`.
 //!
-//! Poses are world-to-camera (quaternion w first, OpenCV axes). Ids have gaps. Scale and orientation of the world are
-//! whatever the reconstruction made them.
+//! Poses are world-to-camera (quaternion w first, OpenCV axes). Ids have gaps. Scale and orientation of the
+//! world are whatever the reconstruction made them.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

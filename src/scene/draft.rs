@@ -41,7 +41,7 @@ pub(crate) struct Draft {
     pub source: PathBuf,
     pub frames: Vec<DraftFrame>,
     pub aabb: Option<Aabb>,
-    /// How far from the cameras (along their axes, world units) things are, where the file says so.
+    /// How far from the cameras things are (world units), where the file says so.
     pub reach: Option<f64>,
     pub points: Vec<DVec3>,
     pub depth_unit: f64,

@@ -1,8 +1,9 @@
 //! EPIC-Diff, the data set of NeuralDiff (Tschernezki et al., 3DV 2021): `meta.json` and `frames/`.
 //!
-//! `ids_all|train|val|test` are lists of frame ids; `images` (file names in `frames/`), `poses`, `nears` and `fars` are
-//! keyed by id. Poses are 3×4 camera-to-world with OpenGL camera axes; `intrinsics` is one 3×3 matrix in pixels of the
-//! stored images, its principal point counted from the image's corner as COLMAP does. Ids are the video's time axis.
+//! `ids_all|train|val|test` are lists of frame ids; `images` (file names in `frames/`), `poses`, `nears` and
+//! `fars` are keyed by id. Poses are 3×4 camera-to-world with OpenGL camera axes; `intrinsics` is one 3×3
+//! matrix in pixels of the stored images, its principal point counted from the image's corner as COLMAP does.
+//! Ids are the video's time axis.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -135,8 +136,8 @@ impl Splits {
         })
     }
 
-    /// As NeuralDiff uses them: trained on `ids_train`, measured on `ids_test`; `ids_val` are in neither, unless there
-    /// are no test ids.
+    /// As NeuralDiff uses them: trained on `ids_train`, measured on `ids_test`; `ids_val` are in neither,
+    /// unless there are no test ids.
     fn of(&self, id: u32) -> Option<ListedSplit> {
         let within = |set: &Option<BTreeSet<u32>>| set.as_ref().is_some_and(|s| s.contains(&id));
         if self.train.is_none() && self.test.is_none() && self.val.is_empty() {

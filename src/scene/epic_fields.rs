@@ -1,8 +1,9 @@
 //! EPIC-Fields: one JSON file a video, camera poses for the frames of EPIC-KITCHENS.
 //!
-//! `camera` as COLMAP has it; `images` maps frame names to `[qw, qx, qy, qz, tx, ty, tz]`, world-to-camera (the first
-//! release: a list with the name as eighth entry); `points` are `[x, y, z, r, g, b]`. Scale is arbitrary. The files
-//! pose every frame of a video, of which people extract a part: frames without an image are left out.
+//! `camera` as COLMAP has it; `images` maps frame names to `[qw, qx, qy, qz, tx, ty, tz]`, world-to-camera
+//! (the first release: a list with the name as eighth entry); `points` are `[x, y, z, r, g, b]`. Scale is
+//! arbitrary. The files pose every frame of a video, of which people extract a part: frames without an image
+//! are left out.
 
 use std::path::{Path, PathBuf};
 

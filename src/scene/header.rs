@@ -1,7 +1,8 @@
 //! The size of an image, from its header alone.
 //!
-//! A scene has thousands of images; opening it must not decode them. PNG tells its size in the first 24 bytes,
-//! JPEG in the first segments, which are walked with seeks over what is of no interest (thumbnails, profiles).
+//! A scene has thousands of images; opening it must not decode them. PNG tells its size in the first 24
+//! bytes, JPEG in the first segments, which are walked with seeks over what is of no interest (thumbnails,
+//! profiles).
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
@@ -16,7 +17,7 @@ pub(crate) struct Header {
     pub width: u32,
     /// Stored height, px.
     pub height: u32,
-    /// EXIF orientation, 1 = upright. Pixels are used as stored: structure from motion did the same.
+    /// EXIF orientation, 1 = upright. Not applied: poses are of the stored pixels.
     pub orientation: u16,
 }
 
@@ -140,8 +141,8 @@ fn exif_orientation(app1: &[u8]) -> Option<u16> {
 
 /// Whether a JPEG ends where it should: behind its scans is an end-of-image marker.
 ///
-/// Decoders fill what a cut file lacks with grey; this tells such a file from a whole one. Bytes behind the end
-/// (phones append some) do not matter.
+/// Decoders fill what a cut file lacks with grey; this tells such a file from a whole one. Bytes behind the
+/// end (phones append some) do not matter.
 pub(crate) fn jpeg_is_complete(bytes: &[u8]) -> bool {
     let mut at = 2;
     loop {

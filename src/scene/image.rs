@@ -21,20 +21,21 @@ pub struct RgbImage {
 impl Frame {
     /// Decodes the frame's image to 8-bit sRGB.
     ///
-    /// Grey becomes equal channels, 16 bits are rounded to 8, alpha is dropped (what shall not be used belongs in
-    /// the mask). Pixels are taken as stored: an EXIF orientation is not applied, because the structure from motion
-    /// that made the poses does not apply it either.
+    /// Grey becomes equal channels, 16 bits are rounded to 8, alpha is dropped (what shall not be used
+    /// belongs in the mask). Pixels are taken as stored: an EXIF orientation is not applied, because the poses
+    /// are of the stored pixels; opening the scene warns of it.
     ///
     /// # Errors
-    /// [`SceneError::Io`], or [`SceneError::Image`] if the file is damaged, cut short or not of the camera's size.
+    /// [`SceneError::Io`], or [`SceneError::Image`] if the file is damaged, cut short or not of the camera's
+    /// size.
     pub fn load_rgb(&self) -> Result<RgbImage, SceneError> {
         let pixels = self.decode(&self.image_path, "image")?.into_rgb8();
         let pixels = pixels.pixels().map(|p| p.0).collect();
         Ok(RgbImage { width: self.camera.width, height: self.camera.height, pixels })
     }
 
-    /// Decodes the frame's depth: `[height * width]` planar depth along the camera's z axis in world units, 0 where
-    /// there is none. `unit` is [`super::Scene::depth_unit`]. `None` if the frame has no depth.
+    /// Decodes the frame's depth: `[height * width]` planar depth along the camera's z axis in world units, 0
+    /// where there is none. `unit` is [`super::Scene::depth_unit`]. `None` if the frame has no depth.
     ///
     /// # Errors
     /// [`SceneError::Io`], or [`SceneError::Image`] if the file is damaged, not a grey PNG or not of the
@@ -57,8 +58,8 @@ impl Frame {
         Ok(Some(stored.into_iter().map(|d| (f64::from(d) * unit) as f32).collect()))
     }
 
-    /// Decodes the frame's mask: `[height * width]`, true where the pixel may be used (any channel but alpha is not
-    /// zero). `None` if the frame has no mask.
+    /// Decodes the frame's mask: `[height * width]`, true where the pixel may be used (any channel but alpha
+    /// is not zero). `None` if the frame has no mask.
     ///
     /// # Errors
     /// [`SceneError::Io`], or [`SceneError::Image`] if the file is damaged or not of the camera's size.

@@ -12,10 +12,13 @@ mod epic_fields;
 mod error;
 mod header;
 mod image;
+mod inspect;
 mod json;
 mod open;
 mod ply_points;
 mod pose;
+#[cfg(test)]
+mod tests;
 mod timeline;
 mod transforms;
 
@@ -25,6 +28,7 @@ pub use camera::{Camera, Pose};
 pub use error::{Place, SceneError};
 use glam::DVec3;
 pub use image::RgbImage;
+pub use inspect::{FolderCount, Inspection, SizeCount, inspect};
 
 /// Which part of the protocol a frame belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]

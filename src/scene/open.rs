@@ -8,10 +8,12 @@ use super::{Scene, assemble, colmap, draft::Draft, epic_diff, epic_fields, json,
 impl Scene {
     /// Opens a scene.
     ///
-    /// `path` is a folder with `transforms.json` (nerfstudio), `meta.json` (EPIC-Diff), a COLMAP model (`sparse/0` and
-    /// the like) or one EPIC-Fields JSON, looked for in this order; or one of these JSON files itself.
+    /// `path` is a folder with `transforms.json` (nerfstudio), `meta.json` (EPIC-Diff), a COLMAP model
+    /// (`sparse/0` and the like) or one EPIC-Fields JSON, looked for in this order; or one of these JSON
+    /// files itself.
     ///
-    /// Only lists and image headers are read; pixels are decoded when [`super::Frame::load_rgb`] asks for them.
+    /// Only lists and image headers are read; pixels are decoded when [`super::Frame::load_rgb`] asks for
+    /// them.
     ///
     /// # Errors
     /// [`SceneError`], naming the file, the frame and the key, line or byte at fault, and what to do.
@@ -20,7 +22,8 @@ impl Scene {
     }
 }
 
-fn read(path: &Path) -> Result<Draft, SceneError> {
+/// What the file of a scene lists, before it is checked.
+pub(super) fn read(path: &Path) -> Result<Draft, SceneError> {
     if path.is_file() {
         return read_json(path);
     }
@@ -74,45 +77,9 @@ fn read_json(file: &Path) -> Result<Draft, SceneError> {
         Err(SceneError::invalid(
             file,
             Place::File,
-            "it is none of the known formats (no `frames`; no `poses`, `images` and `intrinsics`; no `camera` and \
-             `images`)",
+            "it is none of the known formats (no `frames`; no `poses`, `images` and `intrinsics`; no \
+             `camera` and `images`)",
             "give a transforms.json, an EPIC-Diff meta.json or an EPIC-Fields file",
         ))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::path::PathBuf;
-
-    use super::super::{Scene, Split};
-
-    fn data(name: &str) -> Option<PathBuf> {
-        let root = std::env::var_os("DIVFF_DATA").map(PathBuf::from);
-        let root = root.unwrap_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"));
-        let folder = root.join(name);
-        if folder.is_dir() {
-            return Some(folder);
-        }
-        eprintln!("SKIPPED: no {name} in the data folder; set DIVFF_DATA to run this test");
-        None
-    }
-
-    #[test]
-    fn shipped_scenes_open_with_their_splits() {
-        for (name, train, test) in [("redkitchen", 175, 25), ("kitchen-a", 210, 30)] {
-            let Some(folder) = data(name) else { continue };
-            let scene = Scene::open(&folder).unwrap();
-            let count = |split| scene.frames.iter().filter(|f| f.split == split).count();
-            assert_eq!((count(Split::Train), count(Split::Test)), (train, test), "{name}");
-            let frame = &scene.frames[4];
-            assert_eq!(frame.split, Split::Test);
-            let rgb = frame.load_rgb().unwrap();
-            assert_eq!(rgb.pixels.len(), (frame.camera.width * frame.camera.height) as usize);
-            let depth = frame.load_depth(scene.depth_unit).unwrap().unwrap();
-            let far = depth.iter().copied().fold(0.0, f32::max);
-            assert!((1.0..10.0).contains(&far), "{name}: {far} m across a kitchen");
-            println!("{name}: {:?}", scene.warnings);
-        }
     }
 }

@@ -40,8 +40,8 @@ struct Header {
 /// Vertex positions of a PLY file, in its own coordinates and units.
 ///
 /// # Errors
-/// [`SceneError`] with the line or byte if the file cannot be read, is cut short, or has its vertices behind other
-/// elements or with lists.
+/// [`SceneError`] with the line or byte if the file cannot be read, is cut short, or has its vertices behind
+/// other elements or with lists.
 pub(crate) fn read(path: &Path) -> Result<Vec<DVec3>, SceneError> {
     let bytes = std::fs::read(path).map_err(|e| SceneError::io(path, e))?;
     let header = read_header(path, &bytes)?;

@@ -4,16 +4,19 @@ use glam::{DAffine3, DMat3, DMat4, DVec3};
 
 use super::Pose;
 
-/// Largest entry of |RᵀR − I| that is repaired rather than refused: the rounding of poses that were written with
-/// four decimals, and no more; a pose that is further off was scaled, sheared or read with other conventions.
+/// Largest entry of |RᵀR − I| that is repaired rather than refused: the rounding of poses that were written
+/// with four decimals, and no more; a pose that is further off was scaled, sheared or read with other
+/// conventions.
 const REPAIRABLE: f64 = 1e-3;
 
-/// OpenGL camera axes (y up, looking along −z) to ours (OpenCV: y down, looking along +z), on the camera's side.
+/// OpenGL camera axes (y up, looking along −z) to ours (OpenCV: y down, looking along +z), on the camera's
+/// side.
 pub(crate) fn from_opengl(c2w: DMat4) -> DMat4 {
     c2w * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0))
 }
 
-/// Inverse of a rigid transform that is not yet checked; what is not rigid stays so and is found by [`checked`].
+/// Inverse of a rigid transform that is not yet checked; what is not rigid stays so and is found by
+/// [`checked`].
 pub(crate) fn inverse_rigid(rotation: DMat3, translation: DVec3) -> DMat4 {
     let r = rotation.transpose();
     DMat4::from_cols(

@@ -9,7 +9,8 @@ use super::error::{Place, SceneError};
 /// Gives every frame a time in `[0, 1]` and a frame index.
 ///
 /// Indices come from the file, else from the number at the end of the image names, else from the order in the
-/// file. Times come from the file (stretched to `[0, 1]` if they are seconds or the like), else from the indices.
+/// file. Times come from the file (stretched to `[0, 1]` if they are seconds or the like), else from the
+/// indices.
 pub(crate) fn complete(draft: &mut Draft, warnings: &mut Vec<String>) -> Result<(), SceneError> {
     let has_index = all_or_none(draft, "frame_index", |f| f.frame_index.is_some())?;
     let has_time = all_or_none(draft, "time", |f| f.time.is_some())?;
@@ -85,8 +86,8 @@ fn check_indices(draft: &Draft) -> Result<(), SceneError> {
     }
 }
 
-/// The numbers at the end of the stems (`frame_000123.jpg`), if all frames have one, all different, behind one
-/// and the same prefix.
+/// The numbers at the end of the stems (`frame_000123.jpg`), if all frames have one, all different, behind
+/// one and the same prefix.
 fn indices_from_names(frames: &[DraftFrame]) -> Option<Vec<u32>> {
     let mut prefixes = BTreeSet::new();
     let mut indices = Vec::with_capacity(frames.len());

@@ -1,8 +1,8 @@
 //! nerfstudio's `transforms.json`: the native format.
 //!
 //! Poses are camera-to-world with OpenGL camera axes. `applied_transform` (and `applied_scale`) lead from the
-//! coordinates of the original reconstruction to the ones saved in the file; they are undone for poses, `aabb` and
-//! sparse points, so that the scene keeps its original coordinates.
+//! coordinates of the original reconstruction to the ones saved in the file; they are undone for poses,
+//! `aabb` and sparse points, so that the scene keeps its original coordinates.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -165,7 +165,13 @@ fn read_aabb(top: &Fields) -> Result<Option<Aabb>, SceneError> {
     let (min, max) = corners.ok_or_else(|| {
         top.invalid("aabb", "expected [[x, y, z], [x, y, z]] with finite numbers", "correct or remove it")
     })?;
-    Ok(Some(Aabb { min: DVec3::from(min), max: DVec3::from(max) }))
+    let aabb = Aabb { min: DVec3::from(min), max: DVec3::from(max) };
+    // Here and not only after `applied_transform` is undone: that sorts the corners.
+    if !aabb.min.cmplt(aabb.max).all() {
+        let what = format!("the box from {} to {} is empty", aabb.min, aabb.max);
+        return Err(top.invalid("aabb", what, "give the smallest corner first, then the largest"));
+    }
+    Ok(Some(aabb))
 }
 
 /// The way from the file's coordinates back to those of the original reconstruction.
@@ -235,8 +241,8 @@ impl Splits {
         Ok(Splits { train, test, val })
     }
 
-    /// The split of a frame. Held out wins over trained on, so that a test stays a test. Frames in none of the
-    /// lists are left out, except where one list alone says what the others are.
+    /// The split of a frame. Held out wins over trained on, so that a test stays a test. Frames in none of
+    /// the lists are left out, except where one list alone says what the others are.
     fn of(&self, file_path: &str) -> Option<ListedSplit> {
         let name = plain(file_path);
         let within = |set: &Option<BTreeSet<String>>| set.as_ref().is_some_and(|s| s.contains(&name));
