@@ -2,7 +2,7 @@
 
 use glam::{UVec3, Vec3};
 
-/// Upper envelope of recent densities on a lattice of cells over `[0, extent]`.
+/// Running mean of recent densities on a lattice of cells over `[0, extent]`.
 #[derive(Clone, Debug)]
 pub struct DensityGrid {
     dims: UVec3,
@@ -52,17 +52,12 @@ impl DensityGrid {
         (cell.as_vec3() + u) / self.per_unit
     }
 
-    /// Lets every cell forget a little.
-    pub fn decay(&mut self, factor: f32) {
-        for s in &mut self.sigma {
-            *s *= factor;
-        }
-    }
-
-    /// Raises the cell of `p` to at least `sigma`. The order of observations does not matter.
+    /// Moves the cell of `p` towards `sigma` by the fraction `rate`.
+    ///
+    /// A mean, not a maximum: an envelope makes fog look opaque, so that what is behind it is never sampled again.
     #[inline(always)]
-    pub fn observe(&mut self, p: Vec3, sigma: f32) {
+    pub fn observe(&mut self, p: Vec3, sigma: f32, rate: f32) {
         let n = self.index(p);
-        self.sigma[n] = self.sigma[n].max(sigma);
+        self.sigma[n] += rate * (sigma - self.sigma[n]);
     }
 }

@@ -35,6 +35,8 @@ pub struct StepPlan {
     pub rays: usize,
     /// Rays come in squares of this many pixels: neighbours share grid cells, and so cache lines.
     pub patch: u32,
+    /// How fast the density grids follow what is seen, per sample.
+    pub grid_rate: f32,
     /// Where samples go.
     pub sampling: Sampling,
     /// Learning rate of the tables.
@@ -181,7 +183,7 @@ impl Optimiser {
                         let o = &o.streams[s];
                         for (pos, sigma) in o.positions.iter().zip(o.sigma.chunks(TILE)) {
                             for (lane, sigma) in sigma.iter().enumerate() {
-                                grid.observe(Vec3::new(pos[0][lane], pos[1][lane], pos[2][lane]), *sigma);
+                                grid.observe(Vec3::new(pos[0][lane], pos[1][lane], pos[2][lane]), *sigma, plan.grid_rate);
                             }
                         }
                     }

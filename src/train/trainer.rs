@@ -26,6 +26,7 @@ pub fn experiment() {
     cfg.persistent.finest = arg("FINEST", 512.0);
     cfg.persistent.log2_rows = arg("LOG2", 17.0) as u32;
     cfg.persistent.levels = arg("LEVELS", 8.0) as usize;
+    cfg.persistent.density_bias = arg("BIAS", 0.0);
     cfg.near = arg("NEAR", 0.015);
     let mut field = Field::new(&cfg, &scene, [true, streams > 1, streams > 1], 1);
     let train: Vec<Frame> = scene.frames.iter().filter(|f| f.split == Split::Train).cloned().collect();
@@ -51,20 +52,19 @@ pub fn experiment() {
         let explore = (0.5 * (1.0 - f * 8.0)).max(arg("EXPL", 0.1));
         let plan = StepPlan {
             step, rays: arg("RAYS", 4096.0) as usize,
-            sampling: Sampling { count: n, step: cell * arg("STEPC", 1.0), explore, sharpness: 1.0 },
+            sampling: Sampling { count: n, step: cell * arg("STEPC", 1.0), explore, sharpness: arg("SHARP", 1.0) },
             table_rate: arg("LR", 1e-2) * cos * warm, network_rate: arg("LRN", 2e-3) * cos * warm,
             exposure_rate: arg("LRE", 1e-3) * cos * warm,
             pose_rate: if f > 0.1 { arg("LRP", 0.0) * cos } else { 0.0 }, rig_rate: if f > 0.1 { arg("LRR", 0.0) * cos } else {0.0},
-            streams: [true, streams > 1, streams > 1], patch: arg("PATCH", 2.0) as u32,
+            grid_rate: arg("GRATE", 0.05), streams: [true, streams > 1, streams > 1], patch: arg("PATCH", 2.0) as u32,
         };
         let r = opt.step(&mut field, &mut grids, &pixels, &lc, &plan, 1);
         evals += r.evaluations; cands += r.candidates; sq += r.squared;
-        if step % 16 == 0 { for g in &mut grids.streams { g.decay(arg("DECAY", 0.9)); } }
         if step % every == 0 || step == steps {
             let el = t0.elapsed().as_secs_f64();
             print!("{step} {el:.1}s {:.2}M/s {:.0} rays/s eval/cand {:.2} train {:.2}", evals as f64 / el / 1e6, (step * r.rays as u64) as f64 / el, evals as f64 / cands as f64, -10.0 * (sq / every as f64).log10());
             sq = 0.0;
-            let stride = if step == steps { 1 } else { 4 };
+            let stride = if step == steps { arg("STRIDE", 1.0) as u32 } else { 4 };
             let model = Model::new(&field, &grids, [true; 3]);
             let (mut se, mut cnt) = (0.0f64, 0usize);
             let (mut sep, mut cntp) = (0.0f64, 0usize);
