@@ -33,8 +33,8 @@ pub struct Features {
 
 /// A mesh, or a point cloud when `triangles` is empty.
 ///
-/// Invariants (checked by every writer): all columns have one entry per vertex; triangle indices are in range; every
-/// number is finite.
+/// Invariants (checked by every writer): all columns have one entry per vertex; triangle indices are in
+/// range; every number is finite.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Geometry {
     /// Name of the object, e.g. `persistent` or `dynamic_000012`.

@@ -1,0 +1,15 @@
+//! NPZ: numpy's zip of arrays. The best form for Python, because feature matrices stay matrices.
+//!
+//! Arrays: `positions` and `normals` (N,3) f32, `colors` (N,3) u8, each attribute (N,1) f32, i32 or u8, each
+//! feature (N,dim) f32, and `triangles` (M,3) i32 of meshes. Name and offset are a JSON object in the zip's
+//! comment, where neither numpy nor Open3D stumbles over them.
+
+mod npy;
+mod read;
+mod write;
+
+pub use read::read_npz;
+pub use write::{NpzCompression, write_npz};
+
+#[cfg(test)]
+mod tests;

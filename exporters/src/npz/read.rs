@@ -1,0 +1,127 @@
+//! NPZ → geometry.
+
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+
+use serde_json::Value;
+use zip::ZipArchive;
+use zip::result::ZipError;
+
+use super::npy::{self, Array, Dtype};
+use crate::error::{Error, Result};
+use crate::geometry::{Attribute, AttributeValues, Features, Geometry};
+
+/// Deflate cannot expand by more than about this factor, so no honest entry claims more.
+const MAX_DEFLATE_RATIO: u64 = 1032;
+
+/// Reads what [`super::write_npz`] and `numpy.savez` write with these array names.
+///
+/// Arrays other than the standard ones become attributes if they have one column, features otherwise.
+///
+/// # Errors
+/// `Io`; `Invalid` for a damaged or truncated archive or array; `NonFinite`; `Unsupported` for other element
+/// types.
+pub fn read_npz(path: &Path) -> Result<Geometry> {
+    let file = File::open(path).map_err(|source| Error::io(path, source))?;
+    let file_bytes = file.metadata().map_err(|source| Error::io(path, source))?.len();
+    let mut archive = ZipArchive::new(BufReader::new(file)).map_err(|error| zip_error(path, error))?;
+    let mut geometry = Geometry::default();
+    read_note(path, archive.comment(), &mut geometry)?;
+    for index in 0..archive.len() {
+        let (name, content) = read_entry(path, &mut archive, index, file_bytes)?;
+        let array = npy::parse(path, &name, &content)?;
+        insert(path, &mut geometry, name, &array)?;
+    }
+    geometry.validate().map_err(|error| match error {
+        Error::Inconsistent { reason, .. } => Error::invalid(path, reason),
+        other => other,
+    })?;
+    Ok(geometry)
+}
+
+fn zip_error(path: &Path, error: ZipError) -> Error {
+    match error {
+        ZipError::Io(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => Error::io(path, source),
+        other => Error::invalid(path, format!("the zip archive is damaged or cut short: {other}")),
+    }
+}
+
+fn read_note(path: &Path, comment: &[u8], geometry: &mut Geometry) -> Result<()> {
+    geometry.name = path.file_stem().map_or(String::new(), |stem| stem.to_string_lossy().into_owned());
+    let Ok(Value::Object(mut note)) = serde_json::from_slice(comment) else { return Ok(()) };
+    if let Some(name) = note.get("name").and_then(Value::as_str) {
+        geometry.name = name.to_owned();
+    }
+    if let Some(offset) = note.remove("offset") {
+        geometry.offset = serde_json::from_value(offset)
+            .map_err(|error| Error::invalid(path, format!("the offset in the zip comment: {error}")))?;
+    }
+    Ok(())
+}
+
+fn read_entry(
+    path: &Path,
+    archive: &mut ZipArchive<BufReader<File>>,
+    index: usize,
+    file_bytes: u64,
+) -> Result<(String, Vec<u8>)> {
+    let mut entry = archive.by_index(index).map_err(|error| zip_error(path, error))?;
+    let Some(name) = entry.name().strip_suffix(".npy").map(str::to_owned) else {
+        return Err(Error::invalid(path, format!("`{}` is no NPY array", entry.name())));
+    };
+    let size = entry.size();
+    if entry.compressed_size() > file_bytes || size > file_bytes.saturating_mul(MAX_DEFLATE_RATIO) {
+        return Err(Error::invalid(path, format!("array `{name}` claims more bytes than the file can hold")));
+    }
+    let mut content = Vec::with_capacity(usize::try_from(size.min(file_bytes)).unwrap_or(0));
+    // One byte more than promised, so that a longer entry is noticed; the checksum is verified on the way.
+    let read = entry.by_ref().take(size.saturating_add(1)).read_to_end(&mut content);
+    read.map_err(|error| Error::invalid(path, format!("array `{name}` cannot be unpacked: {error}")))?;
+    if content.len() as u64 != size {
+        return Err(Error::invalid(path, format!("array `{name}` has {} bytes, not {size}", content.len())));
+    }
+    Ok((name, content))
+}
+
+fn insert(path: &Path, geometry: &mut Geometry, name: String, array: &Array) -> Result<()> {
+    let wrong = |expected: &str| {
+        let reason = format!(
+            "array `{name}` has {} columns of {}, not {expected}",
+            array.columns,
+            array.dtype.descr()
+        );
+        Err(Error::invalid(path, reason))
+    };
+    match (name.as_str(), array.dtype, array.columns) {
+        ("positions", Dtype::F32, 3) => geometry.positions = floats(array).as_chunks().0.to_vec(),
+        ("normals", Dtype::F32, 3) => geometry.normals = floats(array).as_chunks().0.to_vec(),
+        ("colors", Dtype::U8, 3) => geometry.colors = array.bytes.as_chunks().0.to_vec(),
+        ("triangles", Dtype::I32, 3) => {
+            // A negative index turns into a huge one, which validate() rejects.
+            let corners: Vec<u32> = integers(array).into_iter().map(|v| v as u32).collect();
+            geometry.triangles = corners.as_chunks().0.to_vec();
+        }
+        ("positions" | "normals", ..) => return wrong("3 of <f4"),
+        ("colors", ..) => return wrong("3 of |u1"),
+        ("triangles", ..) => return wrong("3 of <i4"),
+        (_, Dtype::F32, 1) => push(geometry, name, AttributeValues::F32(floats(array))),
+        (_, Dtype::I32, 1) => push(geometry, name, AttributeValues::I32(integers(array))),
+        (_, Dtype::U8, 1) => push(geometry, name, AttributeValues::U8(array.bytes.to_vec())),
+        (_, Dtype::F32, dim) => geometry.features.push(Features { name, dim, values: floats(array) }),
+        _ => return wrong("1, or any number of <f4"),
+    }
+    Ok(())
+}
+
+fn push(geometry: &mut Geometry, name: String, values: AttributeValues) {
+    geometry.attributes.push(Attribute { name, values });
+}
+
+fn floats(array: &Array) -> Vec<f32> {
+    array.bytes.as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect()
+}
+
+fn integers(array: &Array) -> Vec<i32> {
+    array.bytes.as_chunks().0.iter().map(|bytes| i32::from_le_bytes(*bytes)).collect()
+}

@@ -1,0 +1,114 @@
+//! Geometry → NPZ.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use serde_json::json;
+use zip::write::{SimpleFileOptions, ZipWriter};
+
+use super::npy::{self, Dtype};
+use crate::atomic::{AtomicWriter, write_atomically};
+use crate::error::Result;
+use crate::geometry::{AttributeValues, Geometry};
+
+/// How the arrays are stored.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum NpzCompression {
+    /// As they are, like `numpy.savez`: fastest, and float features hardly compress.
+    #[default]
+    Stored,
+    /// Deflated, like `numpy.savez_compressed`.
+    Deflated,
+}
+
+/// From here on sizes need zip64 fields, which Open3D's reader does not know.
+const ZIP64_FROM: u64 = u32::MAX as u64;
+
+/// Writes all columns. Open3D's point-cloud reader loads every one of them, matrices included.
+///
+/// # Errors
+/// `Inconsistent` or `NonFinite` when the geometry breaks its invariants; `Io`.
+pub fn write_npz(path: &Path, geometry: &Geometry, compression: NpzCompression) -> Result<()> {
+    geometry.validate()?;
+    write_atomically(path, |file| {
+        let mut archive = Archive { zip: ZipWriter::new(file), compression };
+        archive.geometry(geometry)?;
+        let note = json!({ "name": geometry.name, "offset": geometry.offset });
+        archive.zip.set_comment(note.to_string());
+        archive.zip.finish()?;
+        Ok(())
+    })
+}
+
+struct Archive<'a> {
+    zip: ZipWriter<&'a mut AtomicWriter>,
+    compression: NpzCompression,
+}
+
+impl Archive<'_> {
+    fn geometry(&mut self, geometry: &Geometry) -> io::Result<()> {
+        self.floats("positions", 3, geometry.positions.as_flattened())?;
+        if !geometry.normals.is_empty() {
+            self.floats("normals", 3, geometry.normals.as_flattened())?;
+        }
+        if !geometry.colors.is_empty() {
+            self.bytes("colors", 3, geometry.colors.as_flattened())?;
+        }
+        for attribute in &geometry.attributes {
+            match &attribute.values {
+                AttributeValues::F32(values) => self.floats(&attribute.name, 1, values)?,
+                AttributeValues::I32(values) => {
+                    self.array(&attribute.name, Dtype::I32, 1, values, |v| v.to_le_bytes())?;
+                }
+                AttributeValues::U8(values) => self.bytes(&attribute.name, 1, values)?,
+            }
+        }
+        for features in &geometry.features {
+            self.floats(&features.name, features.dim, &features.values)?;
+        }
+        if !geometry.triangles.is_empty() {
+            // Signed, as Open3D wants it; validate() keeps indices below the vertex count.
+            let corners = geometry.triangles.as_flattened();
+            self.array("triangles", Dtype::I32, 3, corners, |v| v.to_le_bytes())?;
+        }
+        Ok(())
+    }
+
+    fn floats(&mut self, name: &str, columns: usize, values: &[f32]) -> io::Result<()> {
+        self.array(name, Dtype::F32, columns, values, |v| v.to_le_bytes())
+    }
+
+    fn bytes(&mut self, name: &str, columns: usize, values: &[u8]) -> io::Result<()> {
+        self.array(name, Dtype::U8, columns, values, |&v| [v])
+    }
+
+    /// `values` is row-major `[rows, columns]`.
+    fn array<T, const N: usize>(
+        &mut self,
+        name: &str,
+        dtype: Dtype,
+        columns: usize,
+        values: &[T],
+        bytes: impl Fn(&T) -> [u8; N],
+    ) -> io::Result<()> {
+        let header = npy::header(dtype, values.len() / columns, columns);
+        let total = (header.len() + values.len() * N) as u64;
+        let method = match self.compression {
+            NpzCompression::Stored => zip::CompressionMethod::Stored,
+            NpzCompression::Deflated => zip::CompressionMethod::Deflated,
+        };
+        // The default time stamp is fixed (1980), so that the same input gives the same bytes.
+        let options = SimpleFileOptions::default().compression_method(method).large_file(total >= ZIP64_FROM);
+        self.zip.start_file(format!("{name}.npy"), options)?;
+        self.zip.write_all(&header)?;
+        const CHUNK: usize = 1 << 14;
+        let mut buffer = vec![[0; N]; CHUNK.min(values.len())];
+        for chunk in values.chunks(CHUNK) {
+            for (to, from) in buffer.iter_mut().zip(chunk) {
+                *to = bytes(from);
+            }
+            self.zip.write_all(buffer[..chunk.len()].as_flattened())?;
+        }
+        Ok(())
+    }
+}

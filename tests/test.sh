@@ -1,0 +1,29 @@
+#!/usr/bin/env bash
+# The one test command: everything that must hold before a change goes in.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+step() {
+    echo
+    echo "== $*"
+}
+
+step "tools that read our files"
+tests/tools/setup.sh
+
+step "format"
+cargo fmt --all --check
+
+step "lints"
+cargo clippy --workspace --all-targets --locked --release -- -D warnings
+
+step "documentation"
+RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps --locked --release
+
+step "tests, release"
+cargo test --workspace --locked --release
+
+step "tests of the file formats, with overflow checks and debug assertions"
+cargo test --package divff-exporters --locked
+
+step "all passed"
