@@ -5,6 +5,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+pub mod config;
 pub mod extract;
 pub mod field;
 pub mod render;

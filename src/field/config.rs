@@ -28,7 +28,7 @@ pub struct StreamConfig {
 
 /// The three streams and what they share.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub struct FieldConfig {
     /// The environment.
     pub persistent: StreamConfig,
@@ -53,11 +53,25 @@ impl Default for FieldConfig {
             layers: 1,
             code: 0,
             knots: 0,
-            density_bias: 0.0,
+            density_bias: -3.0,
         };
-        let dynamic =
-            StreamConfig { levels: 6, finest: 192.0, layers: 2, code: 16, knots: 40, density_bias: -2.0, ..persistent.clone() };
-        let actor = StreamConfig { levels: 5, coarsest: 8.0, finest: 64.0, log2_rows: 16, knots: 0, ..dynamic.clone() };
+        let dynamic = StreamConfig {
+            levels: 6,
+            finest: 192.0,
+            layers: 2,
+            code: 16,
+            knots: 40,
+            density_bias: -5.0,
+            ..persistent.clone()
+        };
+        let actor = StreamConfig {
+            levels: 5,
+            coarsest: 8.0,
+            finest: 64.0,
+            log2_rows: 16,
+            knots: 0,
+            ..dynamic.clone()
+        };
         Self { persistent, dynamic, actor, actor_reach: 0.25, near: 0.015 }
     }
 }

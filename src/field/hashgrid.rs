@@ -67,7 +67,8 @@ impl HashGrid {
     /// Writes the features of one tile of points (`pos`: x, y, z rows) to `out` `[width][TILE]`.
     #[inline(always)]
     pub fn encode(&self, tables: &[Vec<Row>], pos: &[[f32; TILE]; 3], out: &mut [f32]) {
-        for ((level, table), out) in self.levels.iter().zip(tables).zip(out.chunks_exact_mut(FEATURES * TILE)) {
+        for ((level, table), out) in self.levels.iter().zip(tables).zip(out.chunks_exact_mut(FEATURES * TILE))
+        {
             let (o0, rest) = out.split_at_mut(TILE);
             let (o1, rest) = rest.split_at_mut(TILE);
             let (o2, o3) = rest.split_at_mut(TILE);
@@ -82,13 +83,25 @@ impl HashGrid {
         }
     }
 
-    /// Gradient with respect to the position of a loss whose gradient with respect to the encoding of lane `s` is
-    /// the column `s` of `grad` `[width][TILE]`.
-    pub fn position_gradient(&self, tables: &[Vec<Row>], pos: Vec3, grad: &[f32], s: usize) -> Vec3 {
-        let mut out = Vec3::ZERO;
-        for (n, (level, table)) in self.levels.iter().zip(tables).enumerate() {
-            let g = |f: usize| grad[(n * FEATURES + f) * TILE + s];
-            out += level.position_gradient(table, pos, Row::new(g(0), g(1), g(2), g(3)));
+    /// Gradient with respect to the positions of a tile, of a loss whose gradient with respect to the encoding is
+    /// `grad` `[width][TILE]`.
+    #[inline(always)]
+    pub fn position_gradient(
+        &self,
+        tables: &[Vec<Row>],
+        pos: &[[f32; TILE]; 3],
+        grad: &[f32],
+    ) -> [[f32; TILE]; 3] {
+        let mut out = [[0.0; TILE]; 3];
+        for ((level, table), g) in self.levels.iter().zip(tables).zip(grad.chunks_exact(FEATURES * TILE)) {
+            let corners = level.corners(pos);
+            for s in 0..TILE {
+                let g = Row::new(g[s], g[TILE + s], g[2 * TILE + s], g[3 * TILE + s]);
+                let d = corners.position_gradient(table, g, s) * level.scale;
+                out[0][s] += d.x;
+                out[1][s] += d.y;
+                out[2][s] += d.z;
+            }
         }
         out
     }
@@ -159,17 +172,6 @@ impl Level {
             }
         }
     }
-
-    fn position_gradient(&self, table: &[Row], p: Vec3, g: Row) -> Vec3 {
-        let c = self.corners(&[[p.x; TILE], [p.y; TILE], [p.z; TILE]]);
-        let v = c.rows.map(|r| table[r[0] as usize].dot(g));
-        let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
-        let [x, y, z] = c.frac.map(|f| f[0]);
-        let dx = mix(mix(v[1] - v[0], v[3] - v[2], y), mix(v[5] - v[4], v[7] - v[6], y), z);
-        let dy = mix(mix(v[2] - v[0], v[3] - v[1], x), mix(v[6] - v[4], v[7] - v[5], x), z);
-        let dz = mix(mix(v[4] - v[0], v[5] - v[1], x), mix(v[6] - v[2], v[7] - v[3], x), y);
-        Vec3::new(dx, dy, dz) * self.scale
-    }
 }
 
 impl Corners {
@@ -185,5 +187,18 @@ impl Corners {
         let (c, d) = (along_x(4), along_x(6));
         let (e, f) = (a + (b - a) * fy, c + (d - c) * fy);
         e + (f - e) * fz
+    }
+
+    /// Gradient with respect to the fractions of lane `s`.
+    #[inline(always)]
+    fn position_gradient(&self, table: &[Row], g: Row, s: usize) -> Vec3 {
+        let v = |n: usize| table[self.rows[n][s] as usize].dot(g);
+        let v = [v(0), v(1), v(2), v(3), v(4), v(5), v(6), v(7)];
+        let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
+        let [x, y, z] = [self.frac[0][s], self.frac[1][s], self.frac[2][s]];
+        let dx = mix(mix(v[1] - v[0], v[3] - v[2], y), mix(v[5] - v[4], v[7] - v[6], y), z);
+        let dy = mix(mix(v[2] - v[0], v[3] - v[1], x), mix(v[6] - v[4], v[7] - v[5], x), z);
+        let dz = mix(mix(v[4] - v[0], v[5] - v[1], x), mix(v[6] - v[2], v[7] - v[3], x), y);
+        Vec3::new(dx, dy, dz)
     }
 }

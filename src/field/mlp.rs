@@ -133,7 +133,14 @@ impl Mlp {
     ///
     /// `tiles` and `grads` hold `count` tiles of `stride` floats each; the network's rows start at `offset`.
     #[inline(always)]
-    pub fn accumulate<S: Simd>(&self, simd: S, tiles: TileView, grads: TileView, count: usize, out: &mut [f32]) {
+    pub fn accumulate<S: Simd>(
+        &self,
+        simd: S,
+        tiles: TileView,
+        grads: TileView,
+        count: usize,
+        out: &mut [f32],
+    ) {
         for layer in self.layers() {
             let (gw, gb) = out[layer.param..].split_at_mut(layer.weights());
             let x = tiles.rows(layer.row);

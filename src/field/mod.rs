@@ -14,11 +14,11 @@ use std::ops::Range;
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
-pub use self::config::{FieldConfig, StreamConfig};
 use self::codes::Trajectory;
+pub use self::config::{FieldConfig, StreamConfig};
 use self::hashgrid::{HashGrid, Row};
 use self::stream::{StreamNet, StreamRanges};
-use crate::scene::{Aabb, Scene, Split};
+use crate::scene::Aabb;
 
 /// The three parts of an egocentric scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -87,11 +87,27 @@ pub struct Layout {
     pub len: usize,
 }
 
-/// The shape of the whole field: everything but the learned numbers.
-#[derive(Clone, Debug)]
-pub struct Field {
+/// Everything that determines a field but its learned numbers; stored with every checkpoint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FieldShape {
     /// How it was asked for.
     pub config: FieldConfig,
+    /// World ↔ units.
+    pub normalisation: Normalisation,
+    /// The streams that this scene has.
+    pub streams: [bool; 3],
+    /// Times of the training frames: the knots of exposure and pose refinement.
+    pub times: Vec<f32>,
+    /// What a ray that leaves the box sees, sRGB 0–1.
+    pub background: [f32; 3],
+}
+
+/// The field: three streams, frame codes, exposure and pose refinement.
+#[derive(Clone, Debug)]
+pub struct Field {
+    /// What it was built from.
+    pub shape: FieldShape,
     /// World ↔ units.
     pub normalisation: Normalisation,
     /// The streams that this scene has; `None` for one that is absent.
@@ -120,19 +136,28 @@ pub struct Field {
 pub const VIEW: usize = 8;
 
 impl Field {
-    /// An untrained field for the given streams of a scene.
-    pub fn new(config: &FieldConfig, scene: &Scene, streams: [bool; 3], seed: u64) -> Self {
-        let normalisation = Normalisation::new(scene.bounds);
+    /// An untrained field with all numbers zero; see [`Self::init`].
+    pub fn zeros(shape: FieldShape) -> Self {
+        let (config, normalisation, streams) = (&shape.config, shape.normalisation, shape.streams);
         let extent = normalisation.extent;
-        let times: Vec<f32> =
-            scene.frames.iter().filter(|f| f.split == Split::Train).map(|f| f.time as f32).collect();
+        let times = &shape.times;
         let net = |stream: Stream| {
             let c = config.stream(stream);
             let grid = match stream {
-                Stream::Actor => {
-                    HashGrid::new(Vec3::ONE, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows)
-                }
-                _ => HashGrid::new(extent, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows),
+                Stream::Actor => HashGrid::new(
+                    Vec3::ONE,
+                    c.levels,
+                    Vec3::splat(c.coarsest),
+                    Vec3::splat(c.finest),
+                    c.log2_rows,
+                ),
+                _ => HashGrid::new(
+                    extent,
+                    c.levels,
+                    Vec3::splat(c.coarsest),
+                    Vec3::splat(c.finest),
+                    c.log2_rows,
+                ),
             };
             let view = if stream == Stream::Persistent { VIEW } else { 0 };
             StreamNet::new(grid, c.hidden, c.layers, c.code, view, c.density_bias)
@@ -147,11 +172,10 @@ impl Field {
         let nets = Stream::ALL.map(|s| streams[s as usize].then(|| net(s)));
         let codes = Stream::ALL.map(|s| if streams[s as usize] { code(s) } else { None });
         let exposure = Trajectory::at(times.clone(), 6);
-        let pose = Trajectory::at(times, 6);
+        let pose = Trajectory::at(times.clone(), 6);
         let layout = Layout::new(&nets, &codes, &exposure, &pose);
         let diagonal = extent.length();
-        let mut field = Self {
-            config: config.clone(),
+        Self {
             normalisation,
             tables: nets.each_ref().map(|n| n.as_ref().map_or(Vec::new(), empty_tables)),
             weights: vec![0.0; layout.len],
@@ -162,10 +186,9 @@ impl Field {
             layout,
             near: config.near * diagonal,
             actor_far: config.actor_reach * diagonal,
-            background: Vec3::splat(0.5),
-        };
-        field.init(seed);
-        field
+            background: Vec3::from(shape.background),
+            shape,
+        }
     }
 
     /// The network of a stream, if the scene has it.
@@ -173,7 +196,8 @@ impl Field {
         self.nets[stream as usize].as_ref()
     }
 
-    fn init(&mut self, seed: u64) {
+    /// Gives all weights their random start.
+    pub fn init(&mut self, seed: u64) {
         let mut rng = crate::rng::Rng::new(seed, 0, 0);
         for s in Stream::ALL {
             let Some(net) = &self.nets[s as usize] else { continue };
@@ -230,7 +254,7 @@ fn empty_tables(net: &StreamNet) -> Vec<Vec<Row>> {
 
 /// Real spherical harmonics of degree 1 and 2 of a unit direction, without their constants' signs.
 pub fn view_encoding(d: Vec3) -> [f32; VIEW] {
-    let Vec3 { x, y, z } = if std::env::var("NOVIEW").is_ok() { Vec3::ZERO } else { d };
+    let Vec3 { x, y, z } = d;
     [
         0.488_602_5 * y,
         0.488_602_5 * z,

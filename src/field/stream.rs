@@ -114,13 +114,6 @@ impl StreamBatch {
     pub fn tiles(&self) -> &[[[f32; TILE]; 3]] {
         &self.pos
     }
-
-    /// Position of lane `n`.
-    #[inline(always)]
-    pub fn position(&self, n: usize) -> Vec3 {
-        let p = &self.pos[n / TILE];
-        Vec3::new(p[0][n % TILE], p[1][n % TILE], p[2][n % TILE])
-    }
 }
 
 impl StreamNet {
@@ -232,8 +225,7 @@ impl StreamNet {
         for n in 0..count {
             let lanes = &batch.sample[n * TILE..batch.sample.len().min((n + 1) * TILE)];
             let (trunk, head) = batch.tiles[n * stride..][..stride].split_at(self.trunk.rows() * TILE);
-            let (dtrunk, dhead) =
-                batch.grads[n * stride..][..stride].split_at_mut(self.trunk.rows() * TILE);
+            let (dtrunk, dhead) = batch.grads[n * stride..][..stride].split_at_mut(self.trunk.rows() * TILE);
             let mut raw = [[0.0; TILE]; 5];
             for (lane, &s) in lanes.iter().enumerate() {
                 let s = s as usize;
@@ -291,10 +283,17 @@ impl StreamNet {
         }
     }
 
-    /// The gradient with respect to the position of lane `n`.
-    pub fn position_gradient(&self, w: &StreamWeights, batch: &StreamBatch, n: usize) -> Vec3 {
-        let grad = &batch.grads[n / TILE * self.stride()..][..self.grid.width() * TILE];
-        self.grid.position_gradient(w.tables, batch.position(n), grad, n % TILE)
+    /// Calls `add(sample, gradient)` for the gradient of every lane's position.
+    #[inline(always)]
+    pub fn position_gradient(&self, w: &StreamWeights, batch: &StreamBatch, mut add: impl FnMut(u32, Vec3)) {
+        let stride = self.stride();
+        for (n, (lanes, pos)) in batch.sample.chunks(TILE).zip(&batch.pos).enumerate() {
+            let grad = &batch.grads[n * stride..][..self.grid.width() * TILE];
+            let d = self.grid.position_gradient(w.tables, pos, grad);
+            for (lane, s) in lanes.iter().enumerate() {
+                add(*s, Vec3::new(d[0][lane], d[1][lane], d[2][lane]));
+            }
+        }
     }
 }
 

@@ -76,8 +76,11 @@ pub fn backward(
         let (i, w, g) = (&intervals[k], &weighted[k], &d_weight[k]);
         let tau = (i.sigma[0] + i.sigma[1] + i.sigma[2]) * i.delta;
         // φ'(a) = (e^−a − φ)/a; its series −1/2 + a/3 − a²/8 where the difference cancels.
-        let d_phi =
-            if tau > 0.05 { (w.pass - w.phi) / tau } else { -0.5 + tau * (1.0 / 3.0 - tau * (0.125 - tau / 30.0)) };
+        let d_phi = if tau > 0.05 {
+            (w.pass - w.phi) / tau
+        } else {
+            -0.5 + tau * (1.0 / 3.0 - tau * (0.125 - tau / 30.0))
+        };
         let mixed = i.sigma[0] * g[0] + i.sigma[1] * g[1] + i.sigma[2] * g[2];
         let shared = w.transmittance * i.delta * i.delta * mixed * d_phi - i.delta * behind;
         for s in 0..3 {

@@ -48,7 +48,8 @@ impl DensityGrid {
     /// The point at fraction `u` of cell number `index`.
     pub fn point(&self, index: usize, u: Vec3) -> Vec3 {
         let n = index as u32;
-        let cell = UVec3::new(n % self.dims.x, n / self.dims.x % self.dims.y, n / (self.dims.x * self.dims.y));
+        let cell =
+            UVec3::new(n % self.dims.x, n / self.dims.x % self.dims.y, n / (self.dims.x * self.dims.y));
         (cell.as_vec3() + u) / self.per_unit
     }
 

@@ -22,6 +22,20 @@ pub struct Grids {
     pub threshold: [f32; 3],
 }
 
+impl Grids {
+    /// Fresh grids with `cells` cells along the longest side of the box.
+    pub fn new(field: &Field, cells: f32) -> Self {
+        let extent = field.normalisation.extent;
+        let start = |s: usize| field.nets[s].as_ref().map_or(0.0, |n| n.density_bias.exp());
+        let world = |s: usize, cells: f32| DensityGrid::new(extent, Vec3::splat(1.0 / cells), start(s));
+        let actor = DensityGrid::new(Vec3::ONE, Vec3::splat(1.0 / ACTOR_CELLS), start(2));
+        Self { streams: [world(0, cells), world(1, 0.5 * cells), actor], threshold: [0.0; 3] }
+    }
+}
+
+/// Cells of the actor's grid along each axis of the frustum.
+const ACTOR_CELLS: f32 = 32.0;
+
 /// A field ready to be evaluated: packed weights and the grids that tell where it is worth it.
 pub struct Model<'a> {
     /// Shape and tables.
@@ -40,7 +54,10 @@ impl<'a> Model<'a> {
         let packed = Stream::ALL.map(|s| {
             let net = field.net(s)?;
             let r = &field.layout.streams[s as usize];
-            Some((net.trunk.pack(&field.weights[r.trunk.clone()]), net.head.pack(&field.weights[r.head.clone()])))
+            Some((
+                net.trunk.pack(&field.weights[r.trunk.clone()]),
+                net.head.pack(&field.weights[r.head.clone()]),
+            ))
         });
         let streams = std::array::from_fn(|s| streams[s] && field.nets[s].is_some());
         Self { field, packed, grids, streams }

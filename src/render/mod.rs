@@ -2,7 +2,7 @@
 
 pub mod composite;
 pub mod density_grid;
-pub mod rays;
-pub mod sampler;
 pub mod forward;
 pub mod image;
+pub mod rays;
+pub mod sampler;

@@ -8,7 +8,7 @@ use crate::render::forward::Chunk;
 
 /// Weights of the loss's terms.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub struct LossConfig {
     /// β_min: uncertainty of the persistent stream, in colour units.
     pub beta_min: f32,
@@ -140,7 +140,8 @@ pub fn backward(
                 let w = &chunk.weighted[k];
                 let alpha = (w.total() / w.transmittance.max(1e-6)).clamp(0.0, 1.0);
                 // d/dσ of α(1−α), weighted by the light that arrives: hard surfaces or nothing.
-                let d = scale * config.entropy * w.transmittance * (1.0 - 2.0 * alpha) * (1.0 - alpha) * delta;
+                let d =
+                    scale * config.entropy * w.transmittance * (1.0 - 2.0 * alpha) * (1.0 - alpha) * delta;
                 grad.sigma[k][0] += d;
             }
             for s in 0..3 {

@@ -1,7 +1,16 @@
 //! Losses, optimiser, schedule and checkpoints.
 
 pub mod adam;
+pub mod checkpoint;
+mod config;
+mod error;
 pub mod loss;
 pub mod pixels;
+mod schedule;
 pub mod step;
-pub mod trainer;
+mod trainer;
+
+pub use self::checkpoint::Trained;
+pub use self::config::{StreamChoice, TrainConfig};
+pub use self::error::TrainError;
+pub use self::trainer::{Control, Progress, TrainReport, Trainer};

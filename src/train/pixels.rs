@@ -51,6 +51,18 @@ impl PixelSet {
         &self.cameras[self.camera_of[n]].1
     }
 
+    /// Mean colour of all images, sRGB 0–1.
+    pub fn mean_colour(&self) -> [f32; 3] {
+        let mut sum = [0u64; 3];
+        for rgb in self.images.iter().flatten() {
+            for c in 0..3 {
+                sum[c] += u64::from(rgb[c]);
+            }
+        }
+        let count = self.images.iter().map(Vec::len).sum::<usize>().max(1);
+        sum.map(|s| (s as f64 / count as f64 / 255.0) as f32)
+    }
+
     /// Whether the mask of frame `n` leaves pixel number `pixel`.
     pub fn is_usable(&self, n: usize, pixel: u32) -> bool {
         self.usable[n].as_ref().is_none_or(|list| list.binary_search(&pixel).is_ok())

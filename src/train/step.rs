@@ -12,8 +12,8 @@ use rayon::prelude::*;
 use super::adam::{self, Moments, StepSize, TableState};
 use super::loss::{self, ChunkGradient, ChunkLoss, LossConfig, RayTarget};
 use super::pixels::PixelSet;
-use crate::field::hashgrid::{Level, Row};
 use crate::field::Field;
+use crate::field::hashgrid::{Level, Row};
 use crate::render::forward::{Chunk, Grids, Model, RayInput};
 use crate::render::rays::View;
 use crate::render::sampler::Sampling;
@@ -170,7 +170,15 @@ impl Optimiser {
                 let levels = net.grid.levels.iter().enumerate();
                 for ((n, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)).rev() {
                     scope.spawn(move |_| {
-                        arch.dispatch(TablePass { outputs, stream: s, level_index: n, level, table, state, rate })
+                        arch.dispatch(TablePass {
+                            outputs,
+                            stream: s,
+                            level_index: n,
+                            level,
+                            table,
+                            state,
+                            rate,
+                        })
                     });
                 }
             }
@@ -183,7 +191,11 @@ impl Optimiser {
                         let o = &o.streams[s];
                         for (pos, sigma) in o.positions.iter().zip(o.sigma.chunks(TILE)) {
                             for (lane, sigma) in sigma.iter().enumerate() {
-                                grid.observe(Vec3::new(pos[0][lane], pos[1][lane], pos[2][lane]), *sigma, plan.grid_rate);
+                                grid.observe(
+                                    Vec3::new(pos[0][lane], pos[1][lane], pos[2][lane]),
+                                    *sigma,
+                                    plan.grid_rate,
+                                );
                             }
                         }
                     }
@@ -299,7 +311,8 @@ impl Group {
                 false => first,
             };
             let (x, y) = (pixel as u32 % camera.width, pixel as u32 / camera.width);
-            let uv = Vec2::new((x as f32 + 0.5) / camera.width as f32, (y as f32 + 0.5) / camera.height as f32);
+            let uv =
+                Vec2::new((x as f32 + 0.5) / camera.width as f32, (y as f32 + 0.5) / camera.height as f32);
             self.inputs.push(RayInput {
                 view: frame as u32,
                 dir_cam: pixels.directions(frame)[pixel],
@@ -365,6 +378,7 @@ impl Group {
         }
     }
 
+    #[inline(always)]
     fn pose_gradient(&mut self, context: &Context) {
         let Self { chunk, inputs, dense, .. } = self;
         let field = context.model.field;
@@ -373,13 +387,11 @@ impl Group {
         for s in 0..2 {
             let batch = &chunk.batches[s];
             let (Some(net), Some(w)) = (&field.nets[s], context.model.weights(s)) else { continue };
-            for n in 0..batch.len() {
-                let k = batch.sample[n] as usize;
-                let g = net.position_gradient(&w, batch, n);
-                let ray = &mut per_ray[k / count];
+            net.position_gradient(&w, batch, |k, g| {
+                let ray = &mut per_ray[k as usize / count];
                 ray.0 += g;
-                ray.1 += g * chunk.intervals[k].t;
-            }
+                ray.1 += g * chunk.intervals[k as usize].t;
+            });
         }
         for ((input, ray), (d_origin, d_dir)) in inputs.iter().zip(&chunk.rays).zip(per_ray) {
             let view = &context.views[input.view as usize];

@@ -1,114 +1,293 @@
 //! The training loop.
-use glam::Vec3;
-use crate::scene::*;
-use crate::field::*;
-use crate::render::density_grid::DensityGrid;
-use crate::render::forward::{Grids, Model};
-use crate::render::sampler::Sampling;
-use super::loss::LossConfig;
-use super::pixels::PixelSet;
-use super::step::*;
 
-/// Fresh grids.
-pub fn grids(field: &Field, cell: f32) -> Grids {
-    let e = field.normalisation.extent;
-    let world = |c: f32| DensityGrid::new(e, Vec3::splat(c), 1.0);
-    Grids { streams: [world(cell), world(cell * 1.5), DensityGrid::new(Vec3::ONE, Vec3::splat(1.0/32.0), 1.0)], threshold: [0.0, 0.0, 0.0] }
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use super::checkpoint::{Trained, TrainingState};
+use super::config::StreamChoice;
+use super::error::TrainError;
+use super::pixels::PixelSet;
+use super::step::{Optimiser, StepReport};
+use crate::config::Config;
+use crate::field::{Field, FieldShape, Normalisation};
+use crate::render::forward::{Grids, Model};
+use crate::render::image::render;
+use crate::scene::{Frame, Scene, Split};
+
+/// Steps between two reports.
+const REPORT_EVERY: u64 = 50;
+
+/// Steps between two looks at the held-out frames.
+const TEST_EVERY: u64 = 500;
+
+/// Every how many pixels, in both directions, a held-out frame is looked at while training.
+const TEST_STRIDE: u32 = 8;
+
+/// What the caller hears while training goes on.
+#[derive(Clone, Copy, Debug)]
+pub struct Progress {
+    /// Steps taken.
+    pub step: u64,
+    /// Share of the schedule that is done, 0–1.
+    pub fraction: f64,
+    /// Seconds spent training, over all sessions.
+    pub seconds: f64,
+    /// Mean loss since the last report.
+    pub loss: f64,
+    /// PSNR of the rays since the last report, dB.
+    pub psnr: f64,
+    /// PSNR of the held-out frames (every 8th pixel) when last looked at, dB.
+    pub test_psnr: Option<f64>,
+    /// Rays per second since the last report.
+    pub rays_per_second: f64,
+    /// Field evaluations per second since the last report.
+    pub samples_per_second: f64,
 }
 
-/// experiment
-pub fn experiment() {
-    let arg = |k: &str, d: f32| std::env::var(k).ok().and_then(|v| v.parse().ok()).unwrap_or(d);
-    let path = std::env::args().nth(1).unwrap();
-    let scene = Scene::open(&path).unwrap();
-    let streams = arg("STREAMS", 1.0) as u32;
-    let mut cfg = FieldConfig::default();
-    cfg.persistent.finest = arg("FINEST", 512.0);
-    cfg.persistent.log2_rows = arg("LOG2", 17.0) as u32;
-    cfg.persistent.levels = arg("LEVELS", 8.0) as usize;
-    cfg.persistent.density_bias = arg("BIAS", 0.0);
-    cfg.near = arg("NEAR", 0.015);
-    let mut field = Field::new(&cfg, &scene, [true, streams > 1, streams > 1], 1);
-    let train: Vec<Frame> = scene.frames.iter().filter(|f| f.split == Split::Train).cloned().collect();
-    let test: Vec<Frame> = scene.frames.iter().filter(|f| f.split == Split::Test).cloned().collect();
-    let pixels = PixelSet::load(train).unwrap();
-    let testpix = PixelSet::load(test.clone()).unwrap();
-    let cell = arg("CELL", 1.0/128.0);
-    let mut grids = grids(&field, cell);
-    let mut opt = Optimiser::new(&field);
-    let mut lc = LossConfig::default();
-    lc.distortion = arg("DIST", 0.3);
-    lc.entropy = arg("ENT", 0.0);
-    lc.transient = arg("TRANS", 0.01);
-    let steps = arg("STEPS", 1000.0) as u64;
-    let n = arg("N", 24.0) as usize;
-    let t0 = std::time::Instant::now();
-    let (mut evals, mut cands, mut sq) = (0usize, 0usize, 0.0);
-    let every = arg("EVERY", 500.0) as u64;
-    for step in 1..=steps {
-        let f = step as f32 / steps as f32;
-        let cos = 0.02 + 0.98 * 0.5 * (1.0 + (std::f32::consts::PI * f).cos());
-        let warm = (step as f32 / 50.0).min(1.0);
-        let explore = (0.5 * (1.0 - f * 8.0)).max(arg("EXPL", 0.1));
-        let plan = StepPlan {
-            step, rays: arg("RAYS", 4096.0) as usize,
-            sampling: Sampling { count: n, step: cell * arg("STEPC", 1.0), explore, sharpness: arg("SHARP", 1.0) },
-            table_rate: arg("LR", 1e-2) * cos * warm, network_rate: arg("LRN", 2e-3) * cos * warm,
-            exposure_rate: arg("LRE", 1e-3) * cos * warm,
-            pose_rate: if f > 0.1 { arg("LRP", 0.0) * cos } else { 0.0 }, rig_rate: if f > 0.1 { arg("LRR", 0.0) * cos } else {0.0},
-            grid_rate: arg("GRATE", 0.05), streams: [true, streams > 1, streams > 1], patch: arg("PATCH", 2.0) as u32,
+/// Whether to go on.
+pub type Control = ControlFlow<()>;
+
+/// What a training session did.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrainReport {
+    /// How far it came.
+    pub state: TrainingState,
+    /// Field evaluations (forward and backward, one stream each) per second of training.
+    pub samples_per_second: f64,
+    /// Rays per second of training.
+    pub rays_per_second: f64,
+}
+
+/// Training of one scene's field.
+pub struct Trainer {
+    config: Config,
+    trained: Trained,
+    optimiser: Optimiser,
+    pixels: PixelSet,
+    test: PixelSet,
+    streams: [bool; 3],
+}
+
+impl Trainer {
+    /// A trainer with an untrained field.
+    ///
+    /// # Errors
+    /// A setting that is out of range, or a frame that cannot be read.
+    pub fn new(scene: &Scene, config: &Config) -> Result<Self, TrainError> {
+        config.validate()?;
+        let (pixels, test) = load(scene)?;
+        let all = config.train.streams != StreamChoice::Static;
+        let shape = FieldShape {
+            config: config.field.clone(),
+            normalisation: Normalisation::new(scene.bounds),
+            streams: [true, all, all],
+            times: pixels.frames.iter().map(|f| f.time as f32).collect(),
+            background: pixels.mean_colour(),
         };
-        let r = opt.step(&mut field, &mut grids, &pixels, &lc, &plan, 1);
-        evals += r.evaluations; cands += r.candidates; sq += r.squared;
-        if step % every == 0 || step == steps {
-            let el = t0.elapsed().as_secs_f64();
-            print!("{step} {el:.1}s {:.2}M/s {:.0} rays/s eval/cand {:.2} train {:.2}", evals as f64 / el / 1e6, (step * r.rays as u64) as f64 / el, evals as f64 / cands as f64, -10.0 * (sq / every as f64).log10());
-            sq = 0.0;
-            let stride = if step == steps { arg("STRIDE", 1.0) as u32 } else { 4 };
-            let model = Model::new(&field, &grids, [true; 3]);
-            let (mut se, mut cnt) = (0.0f64, 0usize);
-            let (mut sep, mut cntp) = (0.0f64, 0usize);
-            let mut derr = vec![]; let mut bias = vec![];
-            let mut iou = [[0usize; 2]; 3]; let mut ious = [(0.0, 0); 3];
-            for (i, fr) in test.iter().enumerate() {
-                let mut s = plan.sampling; s.count = arg("NTEST", 48.0) as usize; s.explore = 0.05;
-                let im = crate::render::image::render(&model, fr, &s, stride);
-                let gt = fr.load_depth(scene.depth_unit).unwrap();
-                let sp = scene.root.join("gt/streams").join(format!("{}.png", fr.stem));
-                let lab = image::open(&sp).ok().map(|i| i.into_luma8().into_raw());
-                for y in 0..im.height { for x in 0..im.width {
-                    let k = (y * im.width + x) as usize; let g = (y * stride * fr.camera.width + x * stride) as usize;
-                    let mut e = 0.0;
-                    for c in 0..3 { let d = im.rgb[k][c] as f64 - testpix.images[i][g][c] as f64 / 255.0; e += d * d / 3.0; }
-                    se += e; cnt += 1;
-                    if let Some(l) = &lab { 
-                        if l[g] == 0 { sep += e; cntp += 1; }
-                        let o = im.opacity[k]; let a = if o[1] > o[0] && o[1] >= o[2] {1} else if o[2] > o[0] {2} else {0};
-                        for s in 0..3 { if a == s && l[g] as usize == s { iou[s][0] += 1; } if a == s || l[g] as usize == s { iou[s][1] += 1; } }
-                    }
-                    if let Some(gt) = &gt { if gt[g] > 0.0 { let d = im.depth[k] - gt[g]; derr.push(d.abs()); bias.push(d); } }
-                }}
-                if let Some(l) = &lab { for s in 0..3 { if l.iter().filter(|v| **v as usize == s).count() >= 50 { ious[s].0 += iou[s][0] as f64 / iou[s][1].max(1) as f64; ious[s].1 += 1; } } }
-                iou = [[0; 2]; 3];
-                if step == steps && (i == 3 || i == 10 || i == 20) {
-                    let mut b = image::RgbImage::new(im.width * 4, im.height);
-                    for y in 0..im.height { for x in 0..im.width { let k = (y * im.width + x) as usize; let g = (y * stride * fr.camera.width + x * stride) as usize;
-                        b.put_pixel(x, y, image::Rgb(im.rgb[k].map(|c| (c * 255.0) as u8)));
-                        b.put_pixel(x + im.width, y, image::Rgb(testpix.images[i][g]));
-                        let d = (im.depth[k] / 5.0 * 255.0) as u8; b.put_pixel(x + 2 * im.width, y, image::Rgb([d, d, if d == 0 {100} else {d}]));
-                        b.put_pixel(x + 3 * im.width, y, image::Rgb(im.opacity[k].map(|c| (c * 255.0) as u8)));
-                    }}
-                    b.save(format!("{}_{}.png", std::env::var("OUT").unwrap_or("/work/tmp/exp".into()), i)).unwrap();
+        let mut field = Field::zeros(shape);
+        field.init(config.seed);
+        let grids = Grids::new(&field, config.train.grid_cells);
+        let optimiser = Optimiser::new(&field);
+        let trained = Trained { field, grids, progress: TrainingState::default() };
+        Ok(Self { config: config.clone(), streams: [true, false, false], trained, optimiser, pixels, test })
+    }
+
+    /// A trainer that goes on where the checkpoint in `run` ends.
+    ///
+    /// # Errors
+    /// As [`Self::new`], or a checkpoint that is damaged.
+    pub fn resume(scene: &Scene, config: &Config, run: &Path) -> Result<Self, TrainError> {
+        config.validate()?;
+        let (trained, optimiser) = Trained::resume(run)?;
+        let (pixels, test) = load(scene)?;
+        let streams = match trained.progress.streams_settled {
+            true => trained.field.shape.streams,
+            false => [true, false, false],
+        };
+        Ok(Self { config: config.clone(), trained, optimiser, pixels, test, streams })
+    }
+
+    /// Trains to the end of the schedule, or until `budget` is used up (the schedule then follows the clock), or
+    /// until `watch` says stop; checkpoints go to `run`.
+    ///
+    /// # Errors
+    /// A checkpoint cannot be written, or the numbers diverge; the last good checkpoint stays.
+    pub fn run(
+        &mut self,
+        run: &Path,
+        budget: Option<Duration>,
+        watch: &mut dyn FnMut(&Progress) -> Control,
+    ) -> Result<TrainReport, TrainError> {
+        let before = self.trained.progress.seconds;
+        let start = Instant::now();
+        let mut saved = Instant::now();
+        let mut window = Window::new();
+        while !self.trained.progress.finished {
+            let fraction = self.fraction(budget);
+            if !self.trained.progress.streams_settled && fraction >= self.config.train.static_until {
+                self.settle_streams();
+            }
+            let report = self.step(fraction)?;
+            window.add(&report);
+            self.trained.progress.seconds = before + start.elapsed().as_secs_f64();
+            let fraction = self.fraction(budget);
+            self.trained.progress.finished = fraction >= 1.0;
+            let step = self.trained.progress.step;
+            if step.is_multiple_of(TEST_EVERY) || self.trained.progress.finished {
+                window.test_psnr = self.test_psnr();
+            }
+            if step.is_multiple_of(REPORT_EVERY) || self.trained.progress.finished {
+                let progress = window.report(&self.trained.progress, fraction);
+                if watch(&progress).is_break() {
+                    break;
                 }
             }
-            derr.sort_by(f32::total_cmp); bias.sort_by(f32::total_cmp);
-            let m = |v: &Vec<f32>| if v.is_empty() { 0.0 } else { v[v.len() / 2] };
-            let w5 = derr.iter().filter(|d| **d < 0.05).count() as f32 / derr.len().max(1) as f32;
-            println!(" | test {:.2} pers {:.2} depth med {:.3} bias {:.3} <5cm {:.2} iou {:.2} {:.2} {:.2}", -10.0 * (se / cnt as f64).log10(), -10.0 * (sep / cntp.max(1) as f64).log10(), m(&derr), m(&bias), w5,
-              ious[0].0 / ious[0].1 as f64, ious[1].0 / ious[1].1 as f64, ious[2].0 / ious[2].1 as f64);
+            if saved.elapsed().as_secs_f64() >= self.config.train.checkpoint_seconds {
+                self.save(run)?;
+                saved = Instant::now();
+            }
+        }
+        self.save(run)?;
+        let state = self.trained.progress.clone();
+        let seconds = state.seconds.max(1e-9);
+        Ok(TrainReport {
+            samples_per_second: state.evaluations as f64 / seconds,
+            rays_per_second: state.rays as f64 / seconds,
+            state,
+        })
+    }
+
+    /// The field as it is now.
+    pub fn trained(&self) -> &Trained {
+        &self.trained
+    }
+
+    /// The field, when training is over.
+    pub fn into_trained(self) -> Trained {
+        self.trained
+    }
+
+    fn fraction(&self, budget: Option<Duration>) -> f64 {
+        let p = &self.trained.progress;
+        match budget {
+            Some(budget) => (p.seconds / budget.as_secs_f64()).min(1.0),
+            None => (p.step as f64 / self.config.train.steps as f64).min(1.0),
         }
     }
-    let rig = &field.weights[field.layout.rig.clone()];
-    println!("rig {rig:?} scale {}", field.normalisation.scale);
-    println!("total {:.1}s", t0.elapsed().as_secs_f64());
+
+    fn save(&self, run: &Path) -> Result<(), TrainError> {
+        self.trained.save(run, self.config.train.grid_cells, Some(&self.optimiser))
+    }
+
+    fn step(&mut self, fraction: f64) -> Result<StepReport, TrainError> {
+        let Trained { field, grids, progress } = &mut self.trained;
+        progress.step += 1;
+        let plan = self.config.train.plan(progress.step, fraction, self.streams);
+        let report =
+            self.optimiser.step(field, grids, &self.pixels, &self.config.loss, &plan, self.config.seed);
+        progress.rays += report.rays as u64;
+        progress.evaluations += report.evaluations as u64;
+        progress.candidates += report.candidates as u64;
+        let non_finite = |stage, index| TrainError::NonFinite { stage, step: progress.step, index };
+        if !report.loss.is_finite() {
+            return Err(non_finite("the loss", 0));
+        }
+        match field.weights.iter().position(|w| !w.is_finite()) {
+            Some(index) => Err(non_finite("a network weight", index)),
+            None => Ok(report),
+        }
+    }
+
+    /// Decides which streams the scene needs, once the persistent one has had its time alone.
+    fn settle_streams(&mut self) {
+        let asked = self.trained.field.shape.streams;
+        self.streams = asked;
+        self.trained.progress.streams_settled = true;
+    }
+
+    fn test_psnr(&self) -> Option<f64> {
+        if self.test.frames.is_empty() {
+            return None;
+        }
+        let model = Model::new(&self.trained.field, &self.trained.grids, self.streams);
+        let sampling = self.config.train.render_sampling();
+        let (mut squared, mut count) = (0.0, 0usize);
+        for (frame, truth) in self.test.frames.iter().zip(&self.test.images) {
+            let image = render(&model, frame, &sampling, TEST_STRIDE);
+            for (n, rgb) in image.rgb.iter().enumerate() {
+                let (x, y) = (n as u32 % image.width * TEST_STRIDE, n as u32 / image.width * TEST_STRIDE);
+                let truth = truth[(y * frame.camera.width + x) as usize];
+                for c in 0..3 {
+                    squared += (f64::from(rgb[c]) - f64::from(truth[c]) / 255.0).powi(2);
+                }
+                count += 3;
+            }
+        }
+        Some(psnr(squared / count as f64))
+    }
+}
+
+fn load(scene: &Scene) -> Result<(PixelSet, PixelSet), TrainError> {
+    let of =
+        |split: Split| -> Vec<Frame> { scene.frames.iter().filter(|f| f.split == split).cloned().collect() };
+    let pixels = PixelSet::load(of(Split::Train))?;
+    if (0..pixels.frames.len()).all(|n| pixels.pick(n, 0.0).is_none()) {
+        return Err(TrainError::NoPixels);
+    }
+    Ok((pixels, PixelSet::load(of(Split::Test))?))
+}
+
+fn psnr(mean_squared: f64) -> f64 {
+    -10.0 * mean_squared.max(1e-12).log10()
+}
+
+/// Sums between two reports.
+struct Window {
+    start: Instant,
+    steps: usize,
+    rays: usize,
+    evaluations: usize,
+    loss: f64,
+    squared: f64,
+    test_psnr: Option<f64>,
+}
+
+impl Window {
+    fn new() -> Self {
+        Self {
+            start: Instant::now(),
+            steps: 0,
+            rays: 0,
+            evaluations: 0,
+            loss: 0.0,
+            squared: 0.0,
+            test_psnr: None,
+        }
+    }
+
+    fn add(&mut self, report: &StepReport) {
+        self.steps += 1;
+        self.rays += report.rays;
+        self.evaluations += report.evaluations;
+        self.loss += report.loss;
+        self.squared += report.squared;
+    }
+
+    fn report(&mut self, state: &TrainingState, fraction: f64) -> Progress {
+        let seconds = self.start.elapsed().as_secs_f64().max(1e-9);
+        let steps = self.steps.max(1) as f64;
+        let progress = Progress {
+            step: state.step,
+            fraction,
+            seconds: state.seconds,
+            loss: self.loss / steps,
+            psnr: psnr(self.squared / steps),
+            test_psnr: self.test_psnr,
+            rays_per_second: self.rays as f64 / seconds,
+            samples_per_second: self.evaluations as f64 / seconds,
+        };
+        *self = Self { test_psnr: self.test_psnr, ..Self::new() };
+        progress
+    }
 }

@@ -1,0 +1,140 @@
+//! Everything that a run can be told, as plain data; the command line and `config.toml` both end up here.
+
+use serde::{Deserialize, Serialize};
+
+use crate::field::FieldConfig;
+use crate::train::TrainConfig;
+use crate::train::loss::LossConfig;
+
+/// How much time a run may take, in round numbers on two cores.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// Under a minute: a first look.
+    Draft,
+    /// Under five minutes.
+    #[default]
+    Standard,
+    /// Until it hardly gets better.
+    Fine,
+}
+
+/// The resolved configuration of a run, stored with it as `config.toml`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Seed of everything random.
+    pub seed: u64,
+    /// The training loop.
+    pub train: TrainConfig,
+    /// The loss.
+    pub loss: LossConfig,
+    /// The field.
+    pub field: FieldConfig,
+}
+
+/// A setting that cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ConfigError {
+    /// Not TOML, an unknown key or a value of the wrong type.
+    #[error("{origin}: {message}")]
+    Syntax {
+        /// File or command-line option.
+        origin: String,
+        /// What the parser says.
+        message: String,
+    },
+    /// A number out of range.
+    #[error("{key} = {value}: {remedy}")]
+    Range {
+        /// Dotted name of the setting.
+        key: &'static str,
+        /// What it was.
+        value: String,
+        /// What it must be.
+        remedy: &'static str,
+    },
+}
+
+impl Config {
+    /// The settings of a preset.
+    pub fn preset(preset: Preset) -> Self {
+        let mut config = Self::default();
+        match preset {
+            Preset::Draft => config.train.steps = 700,
+            Preset::Standard => {}
+            Preset::Fine => config.train.steps *= 5,
+        }
+        config
+    }
+
+    /// These settings with those of a TOML text laid over them; `origin` names it in errors.
+    ///
+    /// # Errors
+    /// [`ConfigError::Syntax`] for text that is not TOML, unknown keys and wrong types.
+    pub fn overlaid(&self, text: &str, origin: &str) -> Result<Self, ConfigError> {
+        let syntax = |message: String| ConfigError::Syntax { origin: origin.to_owned(), message };
+        let over: toml::Table = text.parse().map_err(|e: toml::de::Error| syntax(e.to_string()))?;
+        let mut all = toml::Table::try_from(self).map_err(|e| syntax(e.to_string()))?;
+        merge(&mut all, over);
+        all.try_into().map_err(|e: toml::de::Error| syntax(e.to_string()))
+    }
+
+    /// As TOML, as it stands in `config.toml`.
+    pub fn to_toml(&self) -> String {
+        toml::to_string_pretty(self).unwrap_or_else(|e| unreachable!("plain data is TOML: {e}"))
+    }
+
+    /// Checks every number's range.
+    ///
+    /// # Errors
+    /// [`ConfigError::Range`] names the first setting that is out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let t = &self.train;
+        let range = |key, value: String, ok: bool, remedy| match ok {
+            true => Ok(()),
+            false => Err(ConfigError::Range { key, value, remedy }),
+        };
+        range("train.steps", t.steps.to_string(), t.steps > 0, "must be at least 1")?;
+        range("train.rays", t.rays.to_string(), (1..=1 << 20).contains(&t.rays), "must be 1 to 1048576")?;
+        let samples = (2..=256).contains(&t.samples);
+        range("train.samples", t.samples.to_string(), samples, "must be 2 to 256")?;
+        range("train.patch", t.patch.to_string(), [1, 2, 4].contains(&t.patch), "must be 1, 2 or 4")?;
+        let cells = (8.0..=1024.0).contains(&t.grid_cells);
+        range("train.grid_cells", t.grid_cells.to_string(), cells, "must be 8 to 1024")?;
+        for (key, rate) in [("train.table_rate", t.table_rate), ("train.network_rate", t.network_rate)] {
+            range(key, rate.to_string(), rate.is_finite() && rate >= 0.0, "must be finite and not negative")?;
+        }
+        let b = self.loss.beta_min;
+        range("loss.beta_min", b.to_string(), b.is_finite() && b > 0.0, "must be positive")?;
+        for (key, c) in [
+            ("field.persistent", &self.field.persistent),
+            ("field.dynamic", &self.field.dynamic),
+            ("field.actor", &self.field.actor),
+        ] {
+            let ok = (1..=16).contains(&c.levels)
+                && (1..=24).contains(&c.log2_rows)
+                && c.coarsest >= 1.0
+                && c.finest >= c.coarsest
+                && c.finest <= 65536.0
+                && (4..=512).contains(&c.hidden)
+                && (1..=8).contains(&c.layers)
+                && c.code <= 64;
+            let remedy = "levels 1-16, log2_rows 1-24, 1 <= coarsest <= finest <= 65536, hidden 4-512, layers 1-8, code <= 64";
+            range(key, format!("{c:?}"), ok, remedy)?;
+        }
+        Ok(())
+    }
+}
+
+fn merge(into: &mut toml::Table, over: toml::Table) {
+    for (key, value) in over {
+        match (into.get_mut(&key), value) {
+            (Some(toml::Value::Table(a)), toml::Value::Table(b)) => merge(a, b),
+            (_, value) => {
+                into.insert(key, value);
+            }
+        }
+    }
+}

@@ -1,0 +1,224 @@
+//! A trained field on disk: one safetensors file with the shape as JSON metadata, replaced atomically.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use divff_exporters::atomic::write_bytes_atomically;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+
+use super::error::TrainError;
+use super::step::Optimiser;
+use crate::field::hashgrid::Row;
+use crate::field::{Field, FieldShape, Stream};
+use crate::render::forward::Grids;
+
+/// A field with the density grids that make it fast to evaluate: what training gives, and all that the later
+/// stages need.
+#[derive(Clone, Debug)]
+pub struct Trained {
+    /// The field.
+    pub field: Field,
+    /// Where its densities are.
+    pub grids: Grids,
+    /// How far training has come.
+    pub progress: TrainingState,
+}
+
+/// How far training has come.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingState {
+    /// Steps taken.
+    pub step: u64,
+    /// Seconds spent in them.
+    pub seconds: f64,
+    /// Whether the schedule has come to its end.
+    pub finished: bool,
+    /// Field evaluations, one stream each.
+    pub evaluations: u64,
+    /// Evaluations there would have been at every placed sample for every stream.
+    pub candidates: u64,
+    /// Rays traced.
+    pub rays: u64,
+    /// Whether the streams of the scene have been settled.
+    pub streams_settled: bool,
+    /// Share of image blocks that the persistent stream alone could not explain; `None` before it was measured.
+    pub unexplained: Option<f64>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Header {
+    format: u32,
+    shape: FieldShape,
+    grid_cells: f32,
+    threshold: [f32; 3],
+    progress: TrainingState,
+}
+
+/// Version of the layout of checkpoint files.
+const FORMAT: u32 = 1;
+
+/// The one key of the metadata: a map of several would be written in random order.
+const HEADER: &str = "divff";
+
+impl Trained {
+    /// The checkpoint file of a run.
+    pub fn path(run: &Path) -> PathBuf {
+        run.join("checkpoint").join("field.safetensors")
+    }
+
+    /// Writes the field and, where given, what is needed to resume its training.
+    ///
+    /// # Errors
+    /// The file cannot be written; an older one is then untouched.
+    pub fn save(&self, run: &Path, grid_cells: f32, optimiser: Option<&Optimiser>) -> Result<(), TrainError> {
+        let path = Self::path(run);
+        let folder = run.join("checkpoint");
+        std::fs::create_dir_all(&folder).map_err(|source| TrainError::Io { path: folder, source })?;
+        let header = Header {
+            format: FORMAT,
+            shape: self.field.shape.clone(),
+            grid_cells,
+            threshold: self.grids.threshold,
+            progress: self.progress.clone(),
+        };
+        let json = serde_json::to_string(&header).map_err(|e| damaged(&path, &e.to_string()))?;
+        let mut arrays: Vec<(String, &[f32])> = Vec::new();
+        self.visit(|name, data| arrays.push((name, data)));
+        if let Some(o) = optimiser {
+            o.visit(|name, data| arrays.push((name, data)));
+        }
+        let views = arrays
+            .into_iter()
+            .map(|(name, data)| {
+                let view = TensorView::new(Dtype::F32, vec![data.len()], bytemuck::cast_slice(data));
+                Ok((name, view.map_err(|e| damaged(&path, &e.to_string()))?))
+            })
+            .collect::<Result<Vec<_>, TrainError>>()?;
+        let bytes = safetensors::serialize(views, Some(HashMap::from([(HEADER.to_owned(), json)])))
+            .map_err(|e| damaged(&path, &e.to_string()))?;
+        Ok(write_bytes_atomically(&path, &bytes)?)
+    }
+
+    /// Reads the field of a run.
+    ///
+    /// # Errors
+    /// The file cannot be read, is damaged, or belongs to another version.
+    pub fn load(run: &Path) -> Result<Self, TrainError> {
+        Ok(Self::load_with(run, false)?.0)
+    }
+
+    /// Reads the field and the state of its optimiser, to go on training.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn resume(run: &Path) -> Result<(Self, Optimiser), TrainError> {
+        let (trained, optimiser) = Self::load_with(run, true)?;
+        let path = Self::path(run);
+        Ok((trained, optimiser.ok_or_else(|| damaged(&path, "it holds no optimiser state"))?))
+    }
+
+    fn load_with(run: &Path, optimiser: bool) -> Result<(Self, Option<Optimiser>), TrainError> {
+        let path = Self::path(run);
+        let bytes = std::fs::read(&path).map_err(|source| TrainError::Io { path: path.clone(), source })?;
+        let bad = |e: safetensors::SafeTensorError| damaged(&path, &e.to_string());
+        let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(bad)?;
+        let tensors = SafeTensors::deserialize(&bytes).map_err(bad)?;
+        let json = metadata.metadata().as_ref().and_then(|m| m.get(HEADER));
+        let json = json.ok_or_else(|| damaged(&path, "it has no header"))?;
+        let header: Header = serde_json::from_str(json).map_err(|e| damaged(&path, &e.to_string()))?;
+        if header.format != FORMAT {
+            return Err(damaged(&path, &format!("its format is {} and not {FORMAT}", header.format)));
+        }
+        let field = Field::zeros(header.shape);
+        let mut grids = Grids::new(&field, header.grid_cells);
+        grids.threshold = header.threshold;
+        let mut trained = Self { field, grids, progress: header.progress };
+        let mut fill = |name: String, into: &mut [f32]| {
+            let tensor = tensors.tensor(&name).map_err(|e| damaged(&path, &format!("{name}: {e}")))?;
+            if tensor.dtype() != Dtype::F32 || tensor.data().len() != into.len() * 4 {
+                return Err(damaged(&path, &format!("{name} has the wrong size")));
+            }
+            for (o, b) in into.iter_mut().zip(tensor.data().chunks_exact(4)) {
+                *o = f32::from_le_bytes([b[0], b[1], b[2], b[3]]);
+            }
+            match into.iter().position(|v| !v.is_finite()) {
+                Some(n) => Err(damaged(&path, &format!("{name}[{n}] is not finite"))),
+                None => Ok(()),
+            }
+        };
+        trained.visit_mut(&mut fill)?;
+        let optimiser = match optimiser && tensors.names().iter().any(|n| n.starts_with("optimiser.")) {
+            true => {
+                let mut o = Optimiser::new(&trained.field);
+                o.visit_mut(&mut fill)?;
+                Some(o)
+            }
+            false => None,
+        };
+        Ok((trained, optimiser))
+    }
+
+    fn visit<'a>(&'a self, mut f: impl FnMut(String, &'a [f32])) {
+        f("weights".to_owned(), &self.field.weights);
+        for s in Stream::ALL {
+            for (n, t) in self.field.tables[s as usize].iter().enumerate() {
+                f(format!("table.{}.{n}", s.name()), bytemuck::cast_slice(t));
+            }
+            f(format!("grid.{}", s.name()), &self.grids.streams[s as usize].sigma);
+        }
+    }
+
+    fn visit_mut(
+        &mut self,
+        f: &mut impl FnMut(String, &mut [f32]) -> Result<(), TrainError>,
+    ) -> Result<(), TrainError> {
+        f("weights".to_owned(), &mut self.field.weights)?;
+        for s in Stream::ALL {
+            for (n, t) in self.field.tables[s as usize].iter_mut().enumerate() {
+                f(format!("table.{}.{n}", s.name()), bytemuck::cast_slice_mut::<Row, f32>(t))?;
+            }
+            f(format!("grid.{}", s.name()), &mut self.grids.streams[s as usize].sigma)?;
+        }
+        Ok(())
+    }
+}
+
+impl Optimiser {
+    fn visit<'a>(&'a self, mut f: impl FnMut(String, &'a [f32])) {
+        f("optimiser.first".to_owned(), &self.dense.first);
+        f("optimiser.second".to_owned(), &self.dense.second);
+        for s in Stream::ALL {
+            for (n, t) in self.tables[s as usize].iter().enumerate() {
+                f(format!("optimiser.{}.{n}.first", s.name()), bytemuck::cast_slice(&t.first));
+                f(format!("optimiser.{}.{n}.second", s.name()), bytemuck::cast_slice(&t.second));
+            }
+        }
+    }
+
+    fn visit_mut(
+        &mut self,
+        f: &mut impl FnMut(String, &mut [f32]) -> Result<(), TrainError>,
+    ) -> Result<(), TrainError> {
+        f("optimiser.first".to_owned(), &mut self.dense.first)?;
+        f("optimiser.second".to_owned(), &mut self.dense.second)?;
+        for s in Stream::ALL {
+            for (n, t) in self.tables[s as usize].iter_mut().enumerate() {
+                let first = bytemuck::cast_slice_mut::<Row, f32>(&mut t.first);
+                f(format!("optimiser.{}.{n}.first", s.name()), first)?;
+                let second = bytemuck::cast_slice_mut::<Row, f32>(&mut t.second);
+                f(format!("optimiser.{}.{n}.second", s.name()), second)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn damaged(path: &Path, what: &str) -> TrainError {
+    TrainError::Checkpoint {
+        path: path.to_owned(),
+        what: what.to_owned(),
+        remedy: "train again with another --out, or delete the checkpoint",
+    }
+}

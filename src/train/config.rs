@@ -1,0 +1,83 @@
+//! Settings of the training loop.
+
+use serde::{Deserialize, Serialize};
+
+/// Which streams are trained.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StreamChoice {
+    /// Dynamic and actor streams where the persistent one alone leaves moving things unexplained.
+    #[default]
+    Auto,
+    /// All three.
+    All,
+    /// The persistent stream alone.
+    Static,
+}
+
+/// Settings of the training loop. Rates are the ones before cosine annealing.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainConfig {
+    /// Steps of the whole schedule.
+    pub steps: u64,
+    /// Rays per step; rounded up to whole chunks.
+    pub rays: usize,
+    /// Rays come in squares of this many pixels a side (1, 2 or 4).
+    pub patch: u32,
+    /// Intervals per ray while training.
+    pub samples: usize,
+    /// Intervals per ray while rendering.
+    pub render_samples: usize,
+    /// Which streams are trained.
+    pub streams: StreamChoice,
+    /// Fraction of the schedule that trains the persistent stream alone.
+    pub static_until: f64,
+    /// Learning rate of the hash tables.
+    pub table_rate: f32,
+    /// Learning rate of networks and codes.
+    pub network_rate: f32,
+    /// Learning rate of per-frame exposure.
+    pub exposure_rate: f32,
+    /// Learning rate of per-frame poses (rad and units); 0 trusts the poses.
+    pub pose_rate: f32,
+    /// Learning rate of what all frames share: camera offset, rotation and focal length; 0 trusts them.
+    pub rig_rate: f32,
+    /// Fraction of the schedule after which poses and rig are refined.
+    pub refine_from: f64,
+    /// Cells of the density grids along the longest side of the box.
+    pub grid_cells: f32,
+    /// How fast the density grids follow, per sample.
+    pub grid_rate: f32,
+    /// The density grids' densities times this place the samples; below 1 looks behind what may be fog.
+    pub sharpness: f32,
+    /// Share of a ray's samples spread evenly at the start, and at the end of the schedule.
+    pub explore: [f32; 2],
+    /// Seconds between checkpoints.
+    pub checkpoint_seconds: f64,
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        Self {
+            steps: 4500,
+            rays: 4096,
+            patch: 4,
+            samples: 20,
+            render_samples: 48,
+            streams: StreamChoice::Auto,
+            static_until: 0.15,
+            table_rate: 2e-2,
+            network_rate: 2e-3,
+            exposure_rate: 1e-3,
+            pose_rate: 1e-4,
+            rig_rate: 1e-4,
+            refine_from: 0.1,
+            grid_cells: 128.0,
+            grid_rate: 0.05,
+            sharpness: 0.3,
+            explore: [0.5, 0.1],
+            checkpoint_seconds: 60.0,
+        }
+    }
+}

@@ -1,0 +1,54 @@
+//! What can go wrong while training.
+
+use std::path::PathBuf;
+
+use crate::config::ConfigError;
+use crate::scene::SceneError;
+
+/// Why training cannot start, continue or be stored.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum TrainError {
+    /// A frame cannot be read.
+    #[error(transparent)]
+    Scene(#[from] SceneError),
+    /// A setting cannot be used.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// No training frame has a usable pixel.
+    #[error("no training frame has a usable pixel: every mask is empty")]
+    NoPixels,
+    /// The numbers have left the range of f32: the learning rate is too high, or the input is not an image.
+    #[error(
+        "{stage} is not finite at step {step} (index {index}); lower train.table_rate and train.network_rate"
+    )]
+    NonFinite {
+        /// What was being computed.
+        stage: &'static str,
+        /// Training step.
+        step: u64,
+        /// Index within the stage.
+        index: usize,
+    },
+    /// A checkpoint that is damaged or of another field.
+    #[error("{}: {what}; {remedy}", path.display())]
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// A file cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// A file cannot be written.
+    #[error(transparent)]
+    Write(#[from] divff_exporters::Error),
+}
