@@ -6,6 +6,8 @@
 #![forbid(unsafe_code)]
 
 pub mod extract;
+mod bvh;
+pub mod eval;
 pub mod field;
 pub mod render;
 mod rng;
