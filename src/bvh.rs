@@ -157,7 +157,8 @@ impl TriangleBvh {
         let mut best: Option<Hit> = None;
         let mut t_best = t_max;
         let mut stack = [(0.0f32, 0u32); STACK];
-        let mut depth = usize::from(!self.nodes.is_empty());
+        let missed = self.nodes.is_empty() || self.box_entry(0, o, inverse) >= t_max;
+        let mut depth = usize::from(!missed);
         while depth > 0 {
             depth -= 1;
             let (entry, index) = stack[depth];

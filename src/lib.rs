@@ -12,5 +12,6 @@ pub mod field;
 pub mod render;
 mod rng;
 pub mod scene;
+pub mod synth;
 mod simd;
 pub mod train;

@@ -3,11 +3,15 @@
 use std::path::PathBuf;
 
 use super::surface::SurfaceError;
+use crate::scene::SceneError;
 
 /// Why an evaluation stopped. A measure without truth is not an error: it is left out.
 #[derive(Debug, thiserror::Error)]
 pub enum EvalError {
-    /// An image of the scene or of the ground truth cannot be read.
+    /// The scene's own images or depths cannot be read.
+    #[error(transparent)]
+    Scene(#[from] SceneError),
+    /// A ground-truth image cannot be read.
     #[error("{path}: {source}; restore the file, or take the ground truth out of the scene", path = path.display())]
     Image {
         /// The file.
@@ -15,15 +19,13 @@ pub enum EvalError {
         /// The decoder's complaint.
         source: image::ImageError,
     },
-    /// A ground-truth image is not stored as it should be.
-    #[error("{path}: is {got}, expected {expected}", path = path.display())]
+    /// A ground-truth label image is not stored as it should be.
+    #[error("{path}: is {got}; store the labels as 8-bit grey", path = path.display())]
     PixelType {
         /// The file.
         path: PathBuf,
         /// What it is.
         got: String,
-        /// What it should be.
-        expected: &'static str,
     },
     /// An image does not have the size that the frame's camera says.
     #[error("{what} of frame {frame} has {got} pixels, its camera {width} x {height}; make the sizes agree")]

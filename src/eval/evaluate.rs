@@ -51,8 +51,7 @@ pub fn evaluate_images(
     let mut sums = ImageSums::default();
     for frame in scene.frames.iter().filter(|f| f.split == Split::Test) {
         metrics.test_frames += 1;
-        let view =
-            render(frame).map_err(|source| EvalError::Render { frame: frame.stem.clone(), source })?;
+        let view = render(frame).map_err(|source| EvalError::Render { frame: frame.stem.clone(), source })?;
         match view {
             Some(view) => sums.add(frame, &view, &FrameTruth::read(scene, frame)?)?,
             None => metrics.missing_frames += 1,
@@ -63,7 +62,8 @@ pub fn evaluate_images(
 }
 
 fn fill_in_images(metrics: &mut Metrics, sums: &ImageSums) {
-    let nothing = if metrics.test_frames == 0 { "the scene has no test frames" } else { "no frame was rendered" };
+    let nothing =
+        if metrics.test_frames == 0 { "the scene has no test frames" } else { "no frame was rendered" };
     let rendered = metrics.test_frames > metrics.missing_frames;
     let absent = &mut metrics.absent;
     let mut keep = |name: &str, value: Option<f64>, reason: &str| {
@@ -79,7 +79,8 @@ fn fill_in_images(metrics: &mut Metrics, sums: &ImageSums) {
     let streams = sums.stream_ious();
     let no_streams = "no true stream covers 50 px, or no stream was rendered";
     metrics.psnr = keep("psnr", sums.psnr(), "no pixels");
-    metrics.psnr_persistent = keep("psnr_persistent", sums.psnr_persistent(), "the scene has no true streams");
+    metrics.psnr_persistent =
+        keep("psnr_persistent", sums.psnr_persistent(), "the scene has no true streams");
     metrics.ssim = keep("ssim", sums.ssim(), "the images are smaller than the 11 px window");
     metrics.depth_median_abs_m =
         keep("depth_median_abs_m", sums.depth_median_abs(), "no true depth, or no depth was rendered");
@@ -188,7 +189,8 @@ fn meshes_of(folder: &Path, stream: &str) -> Result<Vec<(String, PathBuf)>, Eval
     for entry in std::fs::read_dir(folder).map_err(io)? {
         let path = entry.map_err(io)?.path();
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let stem = name.strip_prefix(stream).and_then(|n| n.strip_prefix('_')).and_then(|n| n.strip_suffix(".ply"));
+        let stem =
+            name.strip_prefix(stream).and_then(|n| n.strip_prefix('_')).and_then(|n| n.strip_suffix(".ply"));
         if let Some(stem) = stem {
             found.push((stem.to_owned(), path.clone()));
         }

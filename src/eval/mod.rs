@@ -5,7 +5,7 @@
 //! What has no truth to compare with is absent from [`Metrics`], with the reason in [`Metrics::absent`].
 
 mod error;
-// mod evaluate;
+mod evaluate;
 mod images;
 mod ssim;
 pub mod surface;
@@ -14,7 +14,7 @@ mod truth;
 use std::collections::BTreeMap;
 
 pub use error::EvalError;
-// pub use evaluate::{evaluate, evaluate_geometry, evaluate_images};
+pub use evaluate::{evaluate, evaluate_geometry, evaluate_images};
 pub use images::{ImageSums, RenderedView};
 use serde::{Deserialize, Serialize};
 pub use ssim::ssim;

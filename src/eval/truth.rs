@@ -1,7 +1,5 @@
 //! Reads a scene's ground-truth images.
 
-use std::path::Path;
-
 use image::DynamicImage;
 
 use super::images::check_size;
@@ -25,28 +23,14 @@ impl FrameTruth {
     /// # Errors
     /// Unreadable files, wrong sizes and wrong pixel types.
     pub fn read(scene: &Scene, frame: &Frame) -> Result<Self, EvalError> {
-        let rgb: Vec<[u8; 3]> = open(&frame.image_path)?.to_rgb8().pixels().map(|p| p.0).collect();
-        check_size(frame, "image", rgb.len())?;
-        Ok(Self { rgb, depth: depth(scene, frame)?, streams: streams(scene, frame)? })
+        let depth = frame.load_depth(scene.depth_unit)?;
+        Ok(Self { rgb: frame.load_rgb()?.pixels, depth, streams: streams(scene, frame)? })
     }
-}
-
-/// The frame's depth in world units, if it has one.
-pub(super) fn depth(scene: &Scene, frame: &Frame) -> Result<Option<Vec<f32>>, EvalError> {
-    let Some(path) = &frame.depth_path else { return Ok(None) };
-    let image = open(path)?;
-    // `to_luma16` would rescale 8-bit values without a word.
-    let DynamicImage::ImageLuma16(image) = image else {
-        return Err(pixel_type(path, &image, "16-bit grey"));
-    };
-    check_size(frame, "depth", image.as_raw().len())?;
-    let unit = scene.depth_unit;
-    Ok(Some(image.as_raw().iter().map(|&d| (f64::from(d) * unit) as f32).collect()))
 }
 
 /// A frame with depth as a witness of which surfaces can be seen.
 pub(super) fn depth_view(scene: &Scene, frame: &Frame) -> Result<Option<DepthView>, EvalError> {
-    Ok(depth(scene, frame)?.map(|depth| DepthView::new(frame.camera, frame.c2w, depth)))
+    Ok(frame.load_depth(scene.depth_unit)?.map(|depth| DepthView::new(frame.camera, frame.c2w, depth)))
 }
 
 fn streams(scene: &Scene, frame: &Frame) -> Result<Option<Vec<u8>>, EvalError> {
@@ -54,24 +38,18 @@ fn streams(scene: &Scene, frame: &Frame) -> Result<Option<Vec<u8>>, EvalError> {
     if !path.exists() {
         return Ok(None);
     }
-    let image = open(&path)?;
+    let image = image::open(&path).map_err(|source| EvalError::Image { path: path.clone(), source })?;
     let DynamicImage::ImageLuma8(image) = image else {
-        return Err(pixel_type(&path, &image, "8-bit grey"));
+        return Err(EvalError::PixelType { path, got: format!("{:?}", image.color()) });
     };
     check_size(frame, "true stream image", image.as_raw().len())?;
     Ok(Some(image.into_raw()))
 }
 
-fn open(path: &Path) -> Result<DynamicImage, EvalError> {
-    image::open(path).map_err(|source| EvalError::Image { path: path.to_path_buf(), source })
-}
-
-fn pixel_type(path: &Path, image: &DynamicImage, expected: &'static str) -> EvalError {
-    EvalError::PixelType { path: path.to_path_buf(), got: format!("{:?}", image.color()), expected }
-}
-
 #[cfg(test)]
 pub(super) mod tests {
+    use std::path::Path;
+
     use super::*;
     use crate::scene::{Aabb, Camera, Pose, Split};
     use glam::DVec3;
@@ -114,26 +92,14 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn depth_is_read_in_world_units() {
+    fn sixteen_bit_streams_are_refused() {
         let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("d.png");
-        image::ImageBuffer::<image::Luma<u16>, _>::from_raw(2, 1, vec![0u16, 1500])
-            .unwrap()
-            .save(&path)
-            .unwrap();
-        let mut f = frame(2, 1);
-        f.depth_path = Some(path);
-        assert_eq!(depth(&scene(dir.path()), &f).unwrap().unwrap(), vec![0.0, 1.5]);
-    }
-
-    #[test]
-    fn eight_bit_depth_is_refused() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("d.png");
-        image::GrayImage::new(2, 1).save(&path).unwrap();
-        let mut f = frame(2, 1);
-        f.depth_path = Some(path);
-        assert!(matches!(depth(&scene(dir.path()), &f), Err(EvalError::PixelType { .. })));
+        let folder = dir.path().join("gt/streams");
+        std::fs::create_dir_all(&folder).unwrap();
+        let wide = image::ImageBuffer::<image::Luma<u16>, _>::from_raw(2, 1, vec![0u16, 1]).unwrap();
+        wide.save(folder.join("000004.png")).unwrap();
+        let read = streams(&scene(dir.path()), &frame(2, 1));
+        assert!(matches!(read, Err(EvalError::PixelType { .. })));
     }
 
     #[test]
