@@ -20,10 +20,10 @@ const PARALLEL_SIZE: usize = 16_384;
 /// A node: a box, and either a range of triangles (`count > 0`) or two children.
 #[derive(Clone, Copy, Debug)]
 struct Node {
-    min: Vec3,
+    min: Vec3A,
+    max: Vec3A,
     /// First triangle of a leaf; the right child of an inner node (its left child follows it directly).
     first: u32,
-    max: Vec3,
     count: u32,
 }
 
@@ -130,7 +130,8 @@ impl TriangleBvh {
                 }
                 continue;
             }
-            let [left, right] = [index + 1, node.first].map(|i| (self.box_distance(i, query), i));
+            let left = (self.box_distance(index + 1, query), index + 1);
+            let right = (self.box_distance(node.first, query), node.first);
             let (near, far) = if left.0 <= right.0 { (left, right) } else { (right, left) };
             for child in [far, near] {
                 if child.0 < best.0 {
@@ -181,7 +182,8 @@ impl TriangleBvh {
                 }
                 continue;
             }
-            let [left, right] = [index + 1, node.first].map(|i| (self.box_entry(i, o, inverse), i));
+            let left = (self.box_entry(index + 1, o, inverse), index + 1);
+            let right = (self.box_entry(node.first, o, inverse), node.first);
             let (near, far) = if left.0 <= right.0 { (left, right) } else { (right, left) };
             for child in [far, near] {
                 if child.0 < t_best {
@@ -193,17 +195,19 @@ impl TriangleBvh {
         best
     }
 
+    #[inline(always)]
     fn box_distance(&self, index: u32, query: Vec3A) -> f32 {
         let node = &self.nodes[index as usize];
-        let outside = (Vec3A::from(node.min) - query).max(query - Vec3A::from(node.max)).max(Vec3A::ZERO);
+        let outside = (node.min - query).max(query - node.max).max(Vec3A::ZERO);
         outside.length_squared()
     }
 
     /// Ray parameter where the box is entered, infinite when it is missed.
+    #[inline(always)]
     fn box_entry(&self, index: u32, origin: Vec3A, inverse: Vec3A) -> f32 {
         let node = &self.nodes[index as usize];
-        let a = (Vec3A::from(node.min) - origin) * inverse;
-        let b = (Vec3A::from(node.max) - origin) * inverse;
+        let a = (node.min - origin) * inverse;
+        let b = (node.max - origin) * inverse;
         // 0 * inf = NaN where the ray lies in a face; `min`/`max` then keep the other operand, which is what we want.
         let entry = a.min(b).max_element().max(0.0);
         // 1 + 4 eps: rounding of the slab test must not lose a flat box (Ize, "Robust BVH ray traversal", 2013).
@@ -218,8 +222,7 @@ fn build(items: &mut [Item], base: u32, depth: usize) -> Vec<Node> {
     for item in items.iter() {
         bounds.grow(item.min, item.max);
     }
-    let mut node =
-        Node { min: bounds.min.into(), first: base, max: bounds.max.into(), count: items.len() as u32 };
+    let mut node = Node { min: bounds.min, max: bounds.max, first: base, count: items.len() as u32 };
     if items.len() <= LEAF_SIZE {
         return vec![node];
     }
@@ -354,6 +357,7 @@ fn distance_squared(p: Vec3A, [a, b, c]: [Vec3A; 3]) -> f32 {
 }
 
 /// Ray parameter and barycentric weights (Möller & Trumbore 1997), both sides of the triangle.
+#[inline(always)]
 fn intersect(origin: Vec3, dir: Vec3, [a, b, c]: &[Vec3; 3]) -> Option<(f32, [f32; 2])> {
     // A hair beyond the edges, so that no ray slips between two triangles that share one.
     const SLACK: f32 = 1e-6;
