@@ -1,12 +1,15 @@
-//! A bounding-volume hierarchy over triangles: nearest surface point (for `eval`) and ray casting (for `synth`).
+//! A bounding-volume hierarchy over triangles: nearest surface point (for `eval`) and ray casting (for
+//! `synth`).
 //!
-//! Binary tree built with the binned surface-area heuristic (Wald, "On fast construction of SAH-based bounding
-//! volume hierarchies", 2007). Own code because the crates that offer both queries bring a physics engine's linear
-//! algebra with them. The tree depends on the triangles alone, not on the number of threads that build it.
+//! Binary tree built with the binned surface-area heuristic (Wald, "On fast construction of SAH-based
+//! bounding volume hierarchies", 2007). Own code because the crates that offer both queries bring a physics
+//! engine's linear algebra with them. The tree depends on the triangles alone, not on the number of threads
+//! that build it.
 
 use glam::{Vec3, Vec3A};
 
-/// Triangles per leaf at most. Four fill about two cache lines; smaller leaves cost more nodes than they save tests.
+/// Triangles per leaf at most. Four fill about two cache lines; smaller leaves cost more nodes than they
+/// save tests.
 const LEAF_SIZE: usize = 4;
 /// Bins per split; more gain nothing measurable.
 const BINS: usize = 16;
@@ -208,15 +211,18 @@ impl TriangleBvh {
         let node = &self.nodes[index as usize];
         let a = (node.min - origin) * inverse;
         let b = (node.max - origin) * inverse;
-        // 0 * inf = NaN where the ray lies in a face; `min`/`max` then keep the other operand, which is what we want.
+        // 0 * inf = NaN where the ray lies in a face; `min`/`max` then keep the other operand, which is
+        // what we want.
         let entry = a.min(b).max_element().max(0.0);
-        // 1 + 4 eps: rounding of the slab test must not lose a flat box (Ize, "Robust BVH ray traversal", 2013).
+        // 1 + 4 eps: rounding of the slab test must not lose a flat box (Ize, "Robust BVH ray traversal",
+        // 2013).
         let exit = a.max(b).min_element() * (1.0 + 4.0 * f32::EPSILON);
         if entry <= exit { entry } else { f32::INFINITY }
     }
 }
 
-/// Nodes of the subtree over `items` in depth-first order; indices are relative to the subtree, triangles to `base`.
+/// Nodes of the subtree over `items` in depth-first order; indices are relative to the subtree, triangles
+/// to `base`.
 fn build(items: &mut [Item], base: u32, depth: usize) -> Vec<Node> {
     let mut bounds = Bounds::EMPTY;
     for item in items.iter() {
@@ -249,7 +255,8 @@ fn build(items: &mut [Item], base: u32, depth: usize) -> Vec<Node> {
     nodes
 }
 
-/// Partitions `items` in place and returns the size of the left part, which is neither empty nor everything.
+/// Partitions `items` in place and returns the size of the left part, which is neither empty nor
+/// everything.
 fn split(items: &mut [Item], depth: usize) -> usize {
     let mut centres = Bounds::EMPTY;
     for item in items.iter() {

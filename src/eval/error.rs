@@ -10,9 +10,9 @@ use crate::scene::SceneError;
 pub enum EvalError {
     /// The scene's own images or depths cannot be read.
     #[error(transparent)]
-    Scene(#[from] SceneError),
+    Scene(Box<SceneError>),
     /// A ground-truth image cannot be read.
-    #[error("{path}: {source}; restore the file, or take the ground truth out of the scene", path = path.display())]
+    #[error("{}: {source}; restore the file, or take the ground truth out of the scene", path.display())]
     Image {
         /// The file.
         path: PathBuf,
@@ -81,4 +81,11 @@ pub enum EvalError {
         /// What is wrong with it.
         source: SurfaceError,
     },
+}
+
+// Boxed: the reader's errors are large, and every result here would carry their size.
+impl From<SceneError> for EvalError {
+    fn from(error: SceneError) -> Self {
+        Self::Scene(Box::new(error))
+    }
 }

@@ -18,12 +18,13 @@ type RenderError = Box<dyn std::error::Error + Send + Sync>;
 
 /// Every measure of a run that needs no semantics.
 ///
-/// `render` gives the rendering of a test frame, or `None` where there is none (counted in `missing_frames`).
-/// `map` is the folder with `persistent.ply`, `dynamic_<frame>.ply` and `actor_<frame>.ply`.
+/// `render` gives the rendering of a test frame, or `None` where there is none (counted in
+/// `missing_frames`). `map` is the folder with `persistent.ply`, `dynamic_<frame>.ply` and
+/// `actor_<frame>.ply`.
 ///
 /// # Errors
-/// [`EvalError`] for unreadable or damaged files and renderings. Missing truth or an empty mesh is not an error:
-/// the measure is left out and [`Metrics::absent`] says why.
+/// [`EvalError`] for unreadable or damaged files and renderings. Missing truth or an empty mesh is not an
+/// error: the measure is left out and [`Metrics::absent`] says why.
 pub fn evaluate(
     scene: &Scene,
     map: Option<&Path>,
@@ -93,8 +94,8 @@ fn fill_in_images(metrics: &mut Metrics, sums: &ImageSums) {
 
 /// The measures of the map's meshes against `gt/mesh`, added to `metrics`.
 ///
-/// The persistent surface is judged by the depth of about 80 training frames, a dynamic or actor surface by that of
-/// the frame it belongs to.
+/// The persistent surface is judged by the depth of about 80 training frames, a dynamic or actor surface by
+/// that of the frame it belongs to.
 ///
 /// # Errors
 /// As [`evaluate`].
@@ -179,7 +180,8 @@ fn training_views(scene: &Scene) -> Result<Vec<DepthView>, EvalError> {
     Ok(views?.into_iter().flatten().collect())
 }
 
-/// `(stem, path)` of each `<stream>_<stem>.ply` in `folder`, sorted by name; none when there is no such folder.
+/// `(stem, path)` of each `<stream>_<stem>.ply` in `folder`, sorted by name; none when there is no such
+/// folder.
 fn meshes_of(folder: &Path, stream: &str) -> Result<Vec<(String, PathBuf)>, EvalError> {
     if !folder.is_dir() {
         return Ok(Vec::new());
@@ -201,4 +203,76 @@ fn meshes_of(folder: &Path, stream: &str) -> Result<Vec<(String, PathBuf)>, Eval
 
 fn read_mesh(path: &Path) -> Result<Geometry, EvalError> {
     divff_exporters::read_ply(path).map_err(|source| EvalError::Ply { source: source.into() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::synth::{SynthOptions, generate};
+
+    fn scene() -> (tempfile::TempDir, Scene) {
+        let dir = tempfile::tempdir().unwrap();
+        generate(&SynthOptions { frames: 16, width: 64, height: 36, seed: 1 }, dir.path()).unwrap();
+        let scene = Scene::open(dir.path()).unwrap();
+        (dir, scene)
+    }
+
+    /// The truth itself as a rendering, every colour raised by `offset`.
+    fn perfect(scene: &Scene, frame: &Frame, offset: u8) -> RenderedView {
+        let truth = FrameTruth::read(scene, frame).unwrap();
+        let opacity =
+            |s| truth.streams.as_ref().unwrap().iter().map(|t| f32::from(u8::from(*t == s))).collect();
+        RenderedView {
+            rgb: truth.rgb.iter().map(|p| p.map(|c| c.saturating_add(offset))).collect(),
+            depth: truth.depth.clone(),
+            streams: Some([opacity(0), opacity(1), opacity(2)]),
+        }
+    }
+
+    #[test]
+    fn truth_compared_with_itself_is_perfect() {
+        let (dir, scene) = scene();
+        let map = dir.path().join("gt/mesh");
+        let m = evaluate(&scene, Some(&map), |f| Ok(Some(perfect(&scene, f, 0)))).unwrap();
+        assert_eq!((m.test_frames, m.missing_frames), (2, 0));
+        assert_eq!((m.psnr, m.depth_median_abs_m, m.stream_miou), (None, Some(0.0), Some(1.0)));
+        assert_eq!(m.absent["psnr"], "the images are identical");
+        for surface in [m.persistent, m.dynamic, m.actor] {
+            let surface = surface.unwrap();
+            // f32 rounding of points a few metres from the origin.
+            assert!(surface.chamfer_m < 1e-5 && surface.fscore_2cm == 1.0, "{surface:?}");
+        }
+        assert_eq!((m.dynamic.unwrap().times, m.persistent.unwrap().times), (Some(2), None));
+        let json = serde_json::to_string(&m).unwrap();
+        assert_eq!(serde_json::from_str::<Metrics>(&json).unwrap(), m);
+    }
+
+    #[test]
+    fn what_is_missing_is_absent_with_a_reason() {
+        let (dir, scene) = scene();
+        let map = tempfile::tempdir().unwrap();
+        let header = "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n\
+                      property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n";
+        std::fs::write(map.path().join("persistent.ply"), header).unwrap();
+        let m = evaluate(&scene, Some(map.path()), |_| Ok(None)).unwrap();
+        assert_eq!((m.missing_frames, m.psnr, m.persistent), (2, None, None));
+        assert!(m.absent["persistent"].contains("empty"), "{:?}", m.absent);
+        assert!(m.absent["actor_000004"].contains("no actor_000004.ply"), "{:?}", m.absent);
+
+        std::fs::remove_dir_all(dir.path().join("gt")).unwrap();
+        let m = evaluate(&scene, Some(map.path()), |f| {
+            let rgb = f.load_rgb()?.pixels.iter().map(|p| p.map(|c| c / 2)).collect();
+            Ok(Some(RenderedView { rgb, ..Default::default() }))
+        });
+        let m = m.unwrap();
+        assert!(m.psnr.unwrap() > 5.0 && m.ssim.is_some(), "images need no ground truth but themselves");
+        assert_eq!((m.psnr_persistent, m.stream_miou, m.persistent, m.dynamic), (None, None, None, None));
+    }
+
+    #[test]
+    fn failing_renderers_name_the_frame() {
+        let (_dir, scene) = scene();
+        let error = evaluate_images(&scene, |_| Err("out of memory".into())).unwrap_err();
+        assert_eq!(error.to_string(), "cannot render frame 000004: out of memory");
+    }
 }

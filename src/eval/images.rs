@@ -34,7 +34,8 @@ impl ImageSums {
     /// Compares one rendered frame with what there is of the truth.
     ///
     /// # Errors
-    /// [`EvalError::Size`] when a layer is not as large as the camera, [`EvalError::NonFinite`] for NaN in a layer.
+    /// [`EvalError::Size`] when a layer is not as large as the camera, [`EvalError::NonFinite`] for NaN in
+    /// a layer.
     pub fn add(&mut self, frame: &Frame, view: &RenderedView, truth: &FrameTruth) -> Result<(), EvalError> {
         check_size(frame, "rendered colour", view.rgb.len())?;
         self.add_colour(frame, view, truth);

@@ -10,12 +10,13 @@ const SIGMA: f64 = 1.5;
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
 
-/// Mean SSIM of two sRGB images (Wang et al. 2004, eq. 13): 11 × 11 Gaussian window, σ = 1.5 px, values 0–1, each
-/// channel by itself, averaged over the channels and over the pixels whose whole window lies inside the image.
-/// The same figure as scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5,
-/// use_sample_covariance=False, data_range=1, channel_axis=-1)`.
+/// Mean SSIM of two sRGB images (Wang et al. 2004, eq. 13): 11 × 11 Gaussian window, σ = 1.5 px, values
+/// 0–1, each channel by itself, averaged over the channels and over the pixels whose whole window lies
+/// inside the image. The same figure as scikit-image's `structural_similarity(gaussian_weights=True,
+/// sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1)`.
 ///
-/// `a` and `b` are `[height * width]`; `None` when the image is smaller than the window or the lengths disagree.
+/// `a` and `b` are `[height * width]`; `None` when the image is smaller than the window or the lengths
+/// disagree.
 pub fn ssim(a: &[[u8; 3]], b: &[[u8; 3]], width: usize, height: usize) -> Option<f64> {
     if a.len() != width * height || b.len() != a.len() || width < WINDOW || height < WINDOW {
         return None;
@@ -70,7 +71,8 @@ fn blur(plane: &[f64], width: usize, height: usize, kernel: &[f64; WINDOW]) -> V
 mod tests {
     use super::*;
 
-    /// 24 × 17 px pattern and a changed copy; `ssim_equals_scikit_image` quotes what Python makes of the same formula.
+    /// 24 × 17 px pattern and a changed copy; `ssim_equals_scikit_image` quotes what Python makes of the
+    /// same formula.
     fn pattern(changed: bool) -> Vec<[u8; 3]> {
         let value = |x: usize, y: usize, c: usize| {
             let v = (x * 37 + y * 91 + c * 53 + x * y * (c + 3)) % 256;

@@ -1,8 +1,9 @@
 //! Accuracy, completeness and F-score of one surface against another.
 //!
-//! Both surfaces are sampled uniformly by area; distances go from each sample to the other *surface*, not to its
-//! samples. Only truth that a view saw counts, and only our surface where a view could have seen it: what floats in
-//! front of the truth counts against us, what lies well behind it was never observed by anyone.
+//! Both surfaces are sampled uniformly by area; distances go from each sample to the other *surface*, not
+//! to its samples. Only truth that a view saw counts, and only our surface where a view could have seen it:
+//! what floats in front of the truth counts against us, what lies well behind it was never observed by
+//! anyone.
 
 use divff_exporters::Geometry;
 use glam::{DAffine3, DVec3, Vec3};
@@ -193,8 +194,8 @@ impl SurfaceIndex {
 
     /// `n` samples, uniform by area and the same for the same seed; all points of a point cloud.
     ///
-    /// Stratified: sample *i* falls in the *i*-th of `n` equal shares of the area, which keeps neighbours together
-    /// in memory and the variance low.
+    /// Stratified: sample *i* falls in the *i*-th of `n` equal shares of the area, which keeps neighbours
+    /// together in memory and the variance low.
     pub fn samples(&self, n: usize, seed: u64) -> Vec<Vec3> {
         let Some(&total) = self.cumulative_area.last() else {
             return self.triangles.iter().map(|t| t[0]).collect();
@@ -252,7 +253,8 @@ pub fn compare(
     Ok(summarise(&truth.distances(&our_samples), &ours.distances(&truth_samples)))
 }
 
-/// `accuracy`: distances from our samples to the truth; `completeness`: the other way. Neither may be empty.
+/// `accuracy`: distances from our samples to the truth; `completeness`: the other way. Neither may be
+/// empty.
 fn summarise(accuracy: &[f32], completeness: &[f32]) -> SurfaceMetrics {
     let mean = |d: &[f32]| d.iter().map(|x| f64::from(*x)).sum::<f64>() / d.len() as f64;
     let within = |d: &[f32], t: f32| d.iter().filter(|x| **x < t).count() as f64 / d.len() as f64;
@@ -353,8 +355,8 @@ mod tests {
         assert!(m.completeness_m < 1e-6, "{m:?}");
     }
 
-    /// The measure as DESIGN.md words it, written once more with pseudo-random samples, points for surfaces and a
-    /// double loop, on a bumpy wall with a hole.
+    /// The measure as DESIGN.md words it, written once more with pseudo-random samples, points for surfaces
+    /// and a double loop, on a bumpy wall with a hole.
     #[test]
     fn measures_equal_an_independent_brute_force() {
         let truth = square(1.0, 2.0, 4);
@@ -397,8 +399,8 @@ mod tests {
             let nearest = |p: &DVec3| surface.iter().map(|q| p.distance(*q)).fold(f64::INFINITY, f64::min);
             from.iter().map(nearest).sum::<f64>() / from.len() as f64
         };
-        // 20,000 points on 4 m² are 7 mm apart on average: distances to them are a few mm longer than to the
-        // surface where the surfaces touch, and hardly where they are centimetres apart.
+        // 20,000 points on 4 m² are 7 mm apart on average: distances to them are a few mm longer than to
+        // the surface where the surfaces touch, and hardly where they are centimetres apart.
         let (a, b) = (to(&points(&ours, 2000, 5), &points(&truth, 20_000, 9)), m.accuracy_m);
         let (c, d) = (to(&points(&truth, 2000, 7), &points(&ours, 20_000, 3)), m.completeness_m);
         assert!((a - b).abs() < 0.003, "accuracy {a} {b}");

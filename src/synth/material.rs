@@ -58,7 +58,8 @@ pub(super) struct Look {
 }
 
 impl Material {
-    /// Appearance at texture position `p` (m) with normal `n`; `footprint` (m) is the width of one image sample.
+    /// Appearance at texture position `p` (m) with normal `n`; `footprint` (m) is the width of one image
+    /// sample.
     pub(super) fn look(self, p: Vec3, n: Vec3, footprint: f32) -> Look {
         let (srgb, gloss) = self.paint(p, n, footprint);
         let shines = matches!(self, Self::Outdoors | Self::Lamp);

@@ -96,8 +96,8 @@ impl Mesh {
         }
     }
 
-    /// A surface of revolution about the vertical through `base`. `profile` holds (radius, height) pairs from the
-    /// bottom outwards and up; what lies to the right of its direction is outside.
+    /// A surface of revolution about the vertical through `base`. `profile` holds (radius, height) pairs
+    /// from the bottom outwards and up; what lies to the right of its direction is outside.
     pub(super) fn lathe(&mut self, tag: Tag, base: Vec3, profile: &[(f32, f32)], segments: usize) {
         for pair in profile.windows(2) {
             let ((r0, z0), (r1, z1)) = (pair[0], pair[1]);

@@ -1,11 +1,14 @@
-//! A procedural egocentric kitchen with ground truth: [`generate`] writes a whole scene folder, without any assets.
+//! A procedural egocentric kitchen with ground truth: [`generate`] writes a whole scene folder, without any
+//! assets.
 //!
-//! A head walks between work places and looks around; a hand picks up mugs and pans and puts them down elsewhere.
-//! Poses, depth, instances, streams and meshes are exact: the meshes are what the images show.
+//! A head walks between work places and looks around; a hand picks up mugs and pans and puts them down
+//! elsewhere. Poses, depth, instances, streams and meshes are exact: the meshes are what the images show.
 //!
-//! `room` and `props` say what there is, `story` what happens, `render` what is seen of it, `write` stores it.
+//! `room`, `furniture` and `props` say what there is, `story` what happens, `render` what is seen of it,
+//! `write` stores it.
 
 mod arms;
+mod furniture;
 mod material;
 mod mesh;
 mod noise;
@@ -213,8 +216,9 @@ impl Kitchen {
 
 /// Generates a scene folder at `out`, which must not exist or be empty.
 ///
-/// `transforms.json` is written last and at once: a folder without it is not a scene, so an interrupted call leaves
-/// nothing that could be mistaken for one. The same options give the same bytes on any number of threads.
+/// `transforms.json` is written last and at once: a folder without it is not a scene, so an interrupted
+/// call leaves nothing that could be mistaken for one. The same options give the same bytes on any number
+/// of threads.
 ///
 /// # Errors
 /// [`SynthError`]: options out of range, a folder that is in use, files that cannot be written.

@@ -55,8 +55,8 @@ fn value_noise(p: Vec3, salt: u32) -> f32 {
 
 /// `octaves` of value noise from `size` (m) downwards, about −1…1.
 ///
-/// An octave fades out as its cells approach `footprint`, the width of what one sample stands for: texture that an
-/// image cannot show would only be noise that no reconstruction can explain.
+/// An octave fades out as its cells approach `footprint`, the width of what one sample stands for: texture
+/// that an image cannot show would only be noise that no reconstruction can explain.
 pub(super) fn fbm(p: Vec3, size: f32, octaves: u32, footprint: f32, salt: u32) -> f32 {
     let (mut sum, mut amplitude, mut size) = (0.0, 0.5, size);
     for octave in 0..octaves {
@@ -71,7 +71,8 @@ pub(super) fn fbm(p: Vec3, size: f32, octaves: u32, footprint: f32, salt: u32) -
     sum
 }
 
-/// Share of `[x − footprint/2, x + footprint/2]` that lies on lines of `width` at the multiples of `period`.
+/// Share of `[x − footprint/2, x + footprint/2]` that lies on lines of `width` at the multiples of
+/// `period`.
 pub(super) fn lines(x: f32, period: f32, width: f32, footprint: f32) -> f32 {
     let footprint = footprint.max(1e-4);
     let integral = |x: f32| {

@@ -15,6 +15,9 @@ pub(super) struct Prop {
     pub grip: Vec3,
 }
 
+/// Adds a prop's surfaces to a mesh; the second argument tags a material with the prop's instance.
+type Shape<'a> = &'a dyn Fn(&mut Mesh, &dyn Fn(M) -> Tag);
+
 /// All props; the first has instance number `first`.
 pub(super) fn build(first: u16, seed: u64) -> Vec<Prop> {
     let mut rng = Rng::new(seed ^ 0x70_72_6f_70);
@@ -22,7 +25,7 @@ pub(super) fn build(first: u16, seed: u64) -> Vec<Prop> {
     let china = paint([[226, 220, 206], [222, 176, 60], [120, 160, 190]], &mut rng);
     let glass = paint([[36, 92, 52], [120, 60, 28], [40, 76, 120]], &mut rng);
     let mut parts: Vec<(&'static str, &'static str, Vec3, Mesh)> = Vec::new();
-    let mut add = |name, category, grip: [f32; 3], shape: &dyn Fn(&mut Mesh, &dyn Fn(M) -> Tag)| {
+    let mut add = |name, category, grip: [f32; 3], shape: Shape| {
         let instance = first + parts.len() as u16;
         let mut mesh = Mesh::default();
         shape(&mut mesh, &|material| Tag { instance, material });

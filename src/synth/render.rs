@@ -1,7 +1,9 @@
-//! A small ray caster: exact depth and labels through pixel centres, colours from 2 × 2 samples per pixel.
+//! A small ray caster: exact depth and labels through pixel centres, colours from 2 × 2 samples per pixel
+//! (which need rays of their own only where the neighbourhood isn't flat).
 //!
-//! Lambertian surfaces with a faint highlight under an ambient term (darkened where the surroundings are near), a
-//! ceiling lamp and a window, both with soft shadows from fixed points: no noise, so that two views of a point agree.
+//! Lambertian surfaces with a faint highlight under an ambient term (darkened where the surroundings are
+//! near), a ceiling lamp and a window, both with soft shadows from fixed points: no noise, so that two
+//! views of a point agree.
 
 use glam::{Affine3A, Vec3, Vec3A};
 
@@ -16,7 +18,8 @@ const FAR: f32 = 100.0;
 const LIFT: f32 = 1e-3;
 /// How far ambient occlusion looks, m.
 const OCCLUSION_RANGE: f32 = 0.5;
-/// What moves throws no shadow further than this, m: a pair of arms without a body would cast odd ones on the walls.
+/// What moves throws no shadow further than this, m: a pair of arms without a body would cast odd ones on
+/// the walls.
 const SHADOW_RANGE: f32 = 0.5;
 
 /// A mesh that rays can be cast at.
@@ -79,33 +82,35 @@ pub(super) struct Stage<'a> {
 impl Stage<'_> {
     /// Takes the picture of a camera (OpenCV axes to world).
     pub(super) fn picture(&self, lens: &Lens, c2w: &Affine3A) -> Picture {
-        let pixels = (lens.width * lens.height) as usize;
-        let mut picture =
-            Picture { rgb: vec![0; 3 * pixels], depth: vec![0.0; pixels], instance: vec![0; pixels] };
+        let (width, pixels) = (lens.width as usize, (lens.width * lens.height) as usize);
         let origin = Vec3::from(c2w.translation);
         let (cx, cy) = (lens.width as f32 / 2.0, lens.height as f32 / 2.0);
         let focal = lens.focal as f32;
-        let ray =
-            |u: f32, v: f32| Vec3::from(c2w.matrix3 * Vec3A::new((u - cx) / focal, (v - cy) / focal, 1.0));
-        for i in 0..pixels {
-            let (u, v) = ((i as u32 % lens.width) as f32, (i as u32 / lens.width) as f32);
-            let centre = self.see(origin, ray(u + 0.5, v + 0.5));
+        let cast = |i: usize, du: f32, dv: f32| {
+            let (u, v) = ((i % width) as f32 + 0.5 + du, (i / width) as f32 + 0.5 + dv);
+            let dir = c2w.matrix3 * Vec3A::new((u - cx) / focal, (v - cy) / focal, 1.0);
+            self.see(origin, dir.into())
+        };
+        let centres: Vec<Option<Seen>> = (0..pixels).map(|i| cast(i, 0.0, 0.0)).collect();
+        let mut rgb = Vec::with_capacity(3 * pixels);
+        for (i, centre) in centres.iter().enumerate() {
             let shared = centre.map(|seen| (seen, self.arriving(&seen)));
-            if let Some(seen) = centre {
-                picture.depth[i] = seen.t;
-                picture.instance[i] = seen.tag.instance;
-            }
+            let slopes = slopes(&centres, i, width);
             let mut sum = Vec3::ZERO;
-            for (du, dv) in [(0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)] {
-                if let Some(seen) = self.see(origin, ray(u + du, v + dv)) {
-                    sum += self.shade(&seen, origin, focal, shared.as_ref());
-                }
+            for (du, dv) in [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)] {
+                let seen = match &slopes {
+                    Some((x, y, centre)) => Some(centre.moved(x, du).moved(y, dv)),
+                    None => cast(i, du, dv),
+                };
+                sum += seen.map_or(Vec3::ZERO, |seen| self.shade(&seen, origin, focal, shared.as_ref()));
             }
             // Gamma 2, as in the materials.
             let srgb = (sum / 4.0).clamp(Vec3::ZERO, Vec3::ONE).map(f32::sqrt);
-            picture.rgb[3 * i..3 * i + 3].copy_from_slice(&srgb.to_array().map(|c| (c * 255.0 + 0.5) as u8));
+            rgb.extend(srgb.to_array().map(|c| (c * 255.0 + 0.5) as u8));
         }
-        picture
+        let depth = centres.iter().map(|c| c.map_or(0.0, |seen| seen.t)).collect();
+        let instance = centres.iter().map(|c| c.map_or(0, |seen| seen.tag.instance)).collect();
+        Picture { rgb, depth, instance }
     }
 
     fn see(&self, origin: Vec3, dir: Vec3) -> Option<Seen> {
@@ -183,6 +188,49 @@ impl Stage<'_> {
             window: share([window - Vec3::Y * 0.06 + dx * 2.0, window - Vec3::Y * 0.06 - dx * 2.0]),
         }
     }
+}
+
+impl Seen {
+    /// This point moved by `share` of the way that `slope` holds.
+    fn moved(mut self, slope: &Slope, share: f32) -> Self {
+        self.t += slope.t * share;
+        self.at += slope.at * share;
+        self.texture += slope.texture * share;
+        self
+    }
+}
+
+/// Change per pixel along a row or a column.
+#[derive(Clone, Copy)]
+struct Slope {
+    t: f32,
+    at: Vec3,
+    texture: Vec3,
+}
+
+/// How what is seen changes along x and y about pixel `i`, and what is seen there; `None` unless the pixel
+/// and its four neighbours lie on one plane of one material, where samples between them need no rays of
+/// their own.
+fn slopes(centres: &[Option<Seen>], i: usize, width: usize) -> Option<(Slope, Slope, Seen)> {
+    let (column, row) = (i % width, i / width);
+    if column == 0 || column + 1 == width || row == 0 || (row + 1) * width == centres.len() {
+        return None;
+    }
+    let centre = centres[i]?;
+    let flat = |j: usize| {
+        let n = centres[j]?;
+        let coplanar =
+            (n.at - centre.at).dot(centre.normal).abs() < 1e-3 && n.normal.dot(centre.normal) > 0.9999;
+        (n.tag == centre.tag && coplanar).then_some(n)
+    };
+    let half = |a: Seen, b: Seen| Slope {
+        t: (b.t - a.t) / 2.0,
+        at: (b.at - a.at) / 2.0,
+        texture: (b.texture - a.texture) / 2.0,
+    };
+    let along_x = half(flat(i - 1)?, flat(i + 1)?);
+    let along_y = half(flat(i - width)?, flat(i + width)?);
+    Some((along_x, along_y, centre))
 }
 
 /// Whether a sample may use the light found at the pixel's centre.

@@ -1,6 +1,8 @@
-//! What happens: where the head goes and looks, which objects are carried where, what the hands do meanwhile.
+//! What happens: where the head goes and looks, which objects are carried where, what the hands do
+//! meanwhile.
 //!
-//! Time runs over [0, 1] whatever the number of frames, so that more frames show the same story in finer steps.
+//! Time runs over [0, 1] whatever the number of frames, so that more frames show the same story in finer
+//! steps.
 
 use std::f32::consts::{PI, TAU};
 
@@ -29,7 +31,8 @@ pub(super) struct Head {
     pub pitch: f32,
 }
 
-/// One object carried from a place to another. Times in [0, 1]: lifted `grab…lifted`, put down `lower…release`.
+/// One object carried from a place to another. Times in [0, 1]: lifted `grab…lifted`, put down
+/// `lower…release`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Move {
     pub prop: usize,
@@ -220,7 +223,8 @@ impl Story {
         self.moves.iter().find(|m| m.grab < time && time < m.release).map(|m| m.prop)
     }
 
-    /// Left and right hand: they hang at the lower edge of the view, the right one reaches for what is carried.
+    /// Left and right hand: they hang at the lower edge of the view, the right one reaches for what is
+    /// carried.
     pub(super) fn hands(&self, room: &Room, props: &[Prop], time: f32) -> [Hand; 2] {
         let phase = TAU * time / self.beat;
         let sway =

@@ -112,7 +112,7 @@ fn depth_and_streams_are_those_of_the_meshes() {
 #[test]
 fn head_stays_clear_of_the_furniture() {
     for seed in 0..6 {
-        let options = SynthOptions { frames: 90, width: 24, height: 14, seed };
+        let options = SynthOptions { frames: 60, width: 16, height: 16, seed };
         let kitchen = Kitchen::new(&options);
         for frame in 0..options.frames {
             let p = kitchen.picture(&options.lens(), options.time(frame));
