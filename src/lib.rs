@@ -5,13 +5,13 @@
 //! ```
 #![forbid(unsafe_code)]
 
-pub mod extract;
 mod bvh;
 pub mod eval;
+pub mod extract;
 pub mod field;
 pub mod render;
 mod rng;
 pub mod scene;
-pub mod synth;
 mod simd;
+pub mod synth;
 pub mod train;
