@@ -43,7 +43,7 @@ pub fn evaluate(
 /// The per-pixel measures over the test frames.
 ///
 /// # Errors
-/// As [`evaluate`].
+/// As [`evaluate()`].
 pub fn evaluate_images(
     scene: &Scene,
     mut render: impl FnMut(&Frame) -> Result<Option<RenderedView>, RenderError>,
@@ -98,7 +98,7 @@ fn fill_in_images(metrics: &mut Metrics, sums: &ImageSums) {
 /// that of the frame it belongs to.
 ///
 /// # Errors
-/// As [`evaluate`].
+/// As [`evaluate()`].
 pub fn evaluate_geometry(scene: &Scene, map: &Path, metrics: &mut Metrics) -> Result<(), EvalError> {
     let truth = scene.root.join("gt").join("mesh");
     metrics.persistent = match persistent(scene, map, &truth)? {

@@ -1,8 +1,8 @@
 //! How good a result is: every measure of `metrics.json` that needs a scene's ground truth, semantics
 //! aside.
 //!
-//! [`evaluate`] goes through the test frames and the meshes of a map; the parts stand by themselves:
-//! [`ImageSums`] (PSNR, depth, stream IoU), [`ssim`], [`surface::compare`] (accuracy, completeness,
+//! [`evaluate()`] goes through the test frames and the meshes of a map; the parts stand by themselves:
+//! [`ImageSums`] (PSNR, depth, stream IoU), [`ssim()`], [`surface::compare`] (accuracy, completeness,
 //! F-score). What has no truth to compare with is absent from [`Metrics`], with the reason in
 //! [`Metrics::absent`].
 

@@ -100,6 +100,6 @@ mod tests {
         assert_eq!(ssim(&a, &a[1..], 24, 17), None);
     }
 
-    /// scikit-image 0.26, with the arguments that [`ssim`] names, on the two patterns.
+    /// scikit-image 0.26, with the arguments that [`ssim()`] names, on the two patterns.
     const SCIKIT_IMAGE: f64 = 0.940470012635;
 }
