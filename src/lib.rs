@@ -6,10 +6,13 @@
 #![forbid(unsafe_code)]
 
 pub mod config;
+mod bvh;
+pub mod eval;
 pub mod extract;
 pub mod field;
 pub mod render;
 mod rng;
 pub mod scene;
 mod simd;
+pub mod synth;
 pub mod train;
