@@ -5,8 +5,8 @@
 //! ```
 #![forbid(unsafe_code)]
 
-pub mod config;
 mod bvh;
+pub mod config;
 pub mod eval;
 pub mod extract;
 pub mod field;
