@@ -89,7 +89,7 @@ pub struct FeatureEntry {
     pub model: String,
     /// Whether rows have unit length.
     pub normalised: bool,
-    /// NPZ with `mean` [512] and `basis` [dim, 512], if compressed by a linear map.
+    /// NPZ with `mean[512]` and `basis[dim, 512]`, if compressed by a linear map.
     pub pca_file: Option<String>,
 }
 
