@@ -52,6 +52,16 @@ impl DensityGrid {
         self.sigma[self.index(p, slice)]
     }
 
+    /// Whether σ is at least `threshold` in any cell, of any slice, that the box from `min` to `max` (units) touches.
+    pub fn any_at_least(&self, min: Vec3, max: Vec3, threshold: f32) -> bool {
+        let cell = |p: Vec3| (p * self.per_unit).max(Vec3::ZERO).as_uvec3().min(self.dims - UVec3::ONE);
+        let (a, b) = (cell(min).as_usizevec3(), cell(max).as_usizevec3());
+        let [w, h, d] = self.dims.to_array().map(|n| n as usize);
+        let mut rows = (0..self.slices)
+            .flat_map(|s| (a.z..=b.z).flat_map(move |z| (a.y..=b.y).map(move |y| ((s * d + z) * h + y) * w)));
+        rows.any(|row| self.sigma[row + a.x..=row + b.x].iter().any(|&s| s >= threshold))
+    }
+
     /// The point at fraction `u` of cell number `index`, and a time in its slice (at fraction `v`).
     pub fn point(&self, index: usize, u: Vec3, v: f32) -> (Vec3, f32) {
         let [w, h, d] = self.dims.to_array().map(|n| n as usize);

@@ -188,6 +188,37 @@ impl Chunk {
         }
     }
 
+    /// As [`Self::forward`], but densities and weights alone: colours and uncertainty are not computed.
+    #[inline(always)]
+    pub fn densities<S: Simd>(
+        &mut self,
+        simd: S,
+        model: &Model,
+        views: &[View],
+        inputs: &[RayInput],
+        sampling: &Sampling,
+    ) {
+        let n = sampling.count;
+        self.place_samples(model, views, inputs, sampling);
+        let Self { codes, rays, intervals, weighted, batches, samples, .. } = self;
+        for s in 0..3 {
+            let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
+            let sigma = &mut samples[s].sigma;
+            sigma.clear();
+            sigma.resize(batches[s].len(), 0.0);
+            let code = |k: u32| &codes[s][k as usize / n * net.code..];
+            net.density(simd, &w, &mut batches[s], code, sigma);
+            for (&k, sigma) in batches[s].sample.iter().zip(sigma) {
+                intervals[k as usize].sigma[s] = *sigma;
+            }
+        }
+        weighted.resize(intervals.len(), Weighted::default());
+        for (r, ray) in rays.iter_mut().enumerate() {
+            let range = r * n..(r + 1) * n;
+            ray.left = composite::weights(&intervals[range.clone()], &mut weighted[range]);
+        }
+    }
+
     #[inline(always)]
     fn place_samples(&mut self, model: &Model, views: &[View], inputs: &[RayInput], sampling: &Sampling) {
         let n = sampling.count;
