@@ -5,11 +5,14 @@
 //! ```
 #![forbid(unsafe_code)]
 
+mod bvh;
 pub mod config;
+pub mod eval;
 pub mod extract;
 pub mod field;
 pub mod render;
 mod rng;
 pub mod scene;
 mod simd;
+pub mod synth;
 pub mod train;
