@@ -6,3 +6,4 @@ pub mod forward;
 pub mod image;
 pub mod rays;
 pub mod sampler;
+pub mod views;
