@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::field::FieldConfig;
+use crate::map::MapConfig;
 use crate::train::TrainConfig;
 use crate::train::loss::LossConfig;
 
@@ -35,6 +36,8 @@ pub struct Config {
     pub loss: LossConfig,
     /// The field.
     pub field: FieldConfig,
+    /// What is extracted from it.
+    pub map: MapConfig,
 }
 
 /// A setting that cannot be used.
@@ -131,7 +134,7 @@ impl Config {
             let remedy = "levels 1-16, log2_rows 1-24, 1 <= coarsest <= finest <= 65536, hidden 4-512, layers 1-8, code <= 64";
             range(key, format!("{c:?}"), ok, remedy)?;
         }
-        Ok(())
+        self.map.validate()
     }
 }
 

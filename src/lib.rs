@@ -10,6 +10,7 @@ pub mod config;
 pub mod eval;
 pub mod extract;
 pub mod field;
+pub mod map;
 pub mod pipeline;
 pub mod render;
 pub mod report;

@@ -45,6 +45,9 @@ pub struct Manifest {
     pub affordances: Vec<AffordanceEntry>,
     /// All files but this one, in the order they were added.
     pub files: Vec<FileEntry>,
+    /// What the export could have held and does not, or shares, and why.
+    #[serde(default)]
+    pub skipped: Vec<SkippedEntry>,
     /// Program and version.
     pub tool_version: String,
     /// Seed of the run.
@@ -89,7 +92,7 @@ pub struct FeatureEntry {
     pub model: String,
     /// Whether rows have unit length.
     pub normalised: bool,
-    /// NPZ with `mean` [512] and `basis` [dim, 512], if compressed by a linear map.
+    /// NPZ with `mean[512]` and `basis[dim, 512]`, if compressed by a linear map.
     pub pca_file: Option<String>,
 }
 
@@ -100,6 +103,15 @@ pub struct AffordanceEntry {
     pub name: String,
     /// Phrases.
     pub prompts: Vec<String>,
+}
+
+/// Something that is not in the export, or only as a copy.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SkippedEntry {
+    /// Object or stream.
+    pub what: String,
+    /// Why.
+    pub why: String,
 }
 
 /// A file of the export.

@@ -161,6 +161,11 @@ impl SparseGrid {
         self.report
     }
 
+    /// The corner values of each block in order, x fastest; NaN where unknown.
+    pub fn blocks_of_values(&self) -> impl Iterator<Item = &[f32]> {
+        self.values.chunks_exact(POINTS)
+    }
+
     /// The value at corner `p` (cells from the origin); `None` where it is unknown.
     pub fn value(&self, p: [u32; 3]) -> Option<f32> {
         // Up to eight blocks store a corner; any of them that exists has it.

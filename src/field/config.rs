@@ -60,7 +60,7 @@ impl Default for FieldConfig {
             finest: 192.0,
             layers: 2,
             code: 16,
-            knots: 40,
+            knots: 16,
             density_bias: -5.0,
             ..persistent.clone()
         };

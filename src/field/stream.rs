@@ -18,6 +18,12 @@ const GEOMETRY: usize = 16;
 /// Raw densities are clamped to this before the exponential, so that neither σ nor its gradient overflows.
 const RAW_SIGMA_LIMIT: f32 = 15.0;
 
+/// Largest uncertainty of a stream, in colour units.
+///
+/// NeuralDiff's softplus has no bound, so that a trace of density with an enormous β can excuse any error; bounded, a
+/// stream must really stand in front of a pixel to excuse it.
+const BETA_MAX: f32 = 0.1;
+
 /// Shape of one stream's network.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StreamNet {
@@ -164,7 +170,7 @@ impl StreamNet {
             for v in &mut raw[0] {
                 *v = simd::exp((*v + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
             }
-            for row in &mut raw[1..4] {
+            for row in &mut raw[1..] {
                 for v in row {
                     *v = simd::sigmoid(*v);
                 }
@@ -173,7 +179,7 @@ impl StreamNet {
                 let s = s as usize;
                 out.sigma[s] = raw[0][lane];
                 out.rgb[s] = [raw[1][lane], raw[2][lane], raw[3][lane]];
-                out.beta[s] = softplus(raw[4][lane]);
+                out.beta[s] = BETA_MAX * raw[4][lane];
             }
         }
     }
@@ -234,8 +240,7 @@ impl StreamNet {
                     let v = values.rgb[s][c];
                     raw[1 + c][lane] = grad.rgb[s][c] * v * (1.0 - v);
                 }
-                // d softplus = sigmoid = 1 - e^-softplus.
-                raw[4][lane] = grad.beta[s] * simd::one_minus_exp_neg(values.beta[s]);
+                raw[4][lane] = grad.beta[s] * values.beta[s] * (1.0 - values.beta[s] / BETA_MAX);
             }
             let out = self.head.output_row() * TILE;
             for (k, raw) in raw[1..].iter().enumerate() {
@@ -308,12 +313,6 @@ fn condition<'c>(rows: &mut [f32], width: usize, lanes: &[u32], of: impl Fn(u32)
             rows[k * TILE + lane] = *v;
         }
     }
-}
-
-/// ln(1 + e^x), exact for large |x|.
-#[inline(always)]
-fn softplus(x: f32) -> f32 {
-    x.max(0.0) + simd::exp(-x.abs()).ln_1p()
 }
 
 /// Where one stream's dense parameters are in the field's flat weight vector.

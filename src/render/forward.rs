@@ -8,7 +8,7 @@ use pulp::Simd;
 use super::composite::{self, Interval, Weighted};
 use super::density_grid::DensityGrid;
 use super::rays::{Ray, View};
-use super::sampler::{Sampler, Sampling, occupied};
+use super::sampler::{Sampler, Sampling};
 use crate::field::mlp::Packed;
 use crate::field::stream::{StreamBatch, StreamSamples, StreamWeights};
 use crate::field::{Field, Stream, VIEW, view_encoding};
@@ -26,15 +26,33 @@ impl Grids {
     /// Fresh grids with `cells` cells along the longest side of the box.
     pub fn new(field: &Field, cells: f32) -> Self {
         let extent = field.normalisation.extent;
-        let start = |s: usize| field.nets[s].as_ref().map_or(0.0, |n| n.density_bias.exp());
-        let world = |s: usize, cells: f32| DensityGrid::new(extent, Vec3::splat(1.0 / cells), start(s));
-        let actor = DensityGrid::new(Vec3::ONE, Vec3::splat(1.0 / ACTOR_CELLS), start(2));
-        Self { streams: [world(0, cells), world(1, 0.5 * cells), actor], threshold: [0.0; 3] }
+        let start = field.nets[0].as_ref().map_or(0.0, |n| n.density_bias.exp());
+        let persistent = DensityGrid::new(extent, Vec3::splat(1.0 / cells), 1, start);
+        let dynamic = DensityGrid::new(extent, Vec3::splat(2.0 / cells), TIME_SLICES, UNKNOWN);
+        let actor = DensityGrid::new(Vec3::ONE, Vec3::splat(1.0 / ACTOR_CELLS), TIME_SLICES, UNKNOWN);
+        Self { streams: [persistent, dynamic, actor], threshold: [0.0; 3] }
+    }
+}
+
+impl Grids {
+    /// From now on a stream is skipped in cells that cannot stop the share `alpha` of the light that crosses them.
+    pub fn skip_below(&mut self, alpha: f32) {
+        for (threshold, grid) in self.threshold.iter_mut().zip(&self.streams) {
+            *threshold = alpha / grid.cell().min_element();
+        }
+        // The actor's cells are in the frustum; across the near half of it they are this small at least.
+        self.threshold[2] = self.threshold[1];
     }
 }
 
 /// Cells of the actor's grid along each axis of the frustum.
-const ACTOR_CELLS: f32 = 32.0;
+const ACTOR_CELLS: f32 = 24.0;
+
+/// Density of transient cells that were not looked at yet, 1/unit: enough to be looked at.
+const UNKNOWN: f32 = 2.0;
+
+/// Slices of time of the dynamic and the actor's grid.
+const TIME_SLICES: usize = 32;
 
 /// A field ready to be evaluated: packed weights and the grids that tell where it is worth it.
 pub struct Model<'a> {
@@ -170,6 +188,37 @@ impl Chunk {
         }
     }
 
+    /// As [`Self::forward`], but densities and weights alone: colours and uncertainty are not computed.
+    #[inline(always)]
+    pub fn densities<S: Simd>(
+        &mut self,
+        simd: S,
+        model: &Model,
+        views: &[View],
+        inputs: &[RayInput],
+        sampling: &Sampling,
+    ) {
+        let n = sampling.count;
+        self.place_samples(model, views, inputs, sampling);
+        let Self { codes, rays, intervals, weighted, batches, samples, .. } = self;
+        for s in 0..3 {
+            let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
+            let sigma = &mut samples[s].sigma;
+            sigma.clear();
+            sigma.resize(batches[s].len(), 0.0);
+            let code = |k: u32| &codes[s][k as usize / n * net.code..];
+            net.density(simd, &w, &mut batches[s], code, sigma);
+            for (&k, sigma) in batches[s].sample.iter().zip(sigma) {
+                intervals[k as usize].sigma[s] = *sigma;
+            }
+        }
+        weighted.resize(intervals.len(), Weighted::default());
+        for (r, ray) in rays.iter_mut().enumerate() {
+            let range = r * n..(r + 1) * n;
+            ray.left = composite::weights(&intervals[range.clone()], &mut weighted[range]);
+        }
+    }
+
     #[inline(always)]
     fn place_samples(&mut self, model: &Model, views: &[View], inputs: &[RayInput], sampling: &Sampling) {
         let n = sampling.count;
@@ -194,17 +243,18 @@ impl Chunk {
                     code.evaluate(gamma, at, &mut self.codes[s][r * code.width..(r + 1) * code.width]);
                 }
             }
+            let (slice_d, slice_a) = (grid_d.slice(view.time), grid_a.slice(view.time));
             let sigma = |p: Vec3, t: f32| {
                 let mut sum = 0.0;
                 if model.streams[0] {
-                    sum += grid_p.at(p);
+                    sum += grid_p.at(p, 0);
                 }
                 if model.streams[1] {
-                    sum += grid_d.at(p);
+                    sum += grid_d.at(p, slice_d);
                 }
                 let z = t * input.dir_cam.z;
                 if model.streams[2] && z < field.actor_far {
-                    sum += grid_a.at(model.actor_point(input.uv, z));
+                    sum += grid_a.at(model.actor_point(input.uv, z), slice_a);
                 }
                 sum
             };
@@ -219,15 +269,17 @@ impl Chunk {
                 let delta = self.edges[k + 1] - self.edges[k];
                 self.intervals.push(Interval { sigma: [0.0; 3], delta, t });
                 let p = ray.origin + ray.dir * t;
-                for (s, grid) in [grid_p, grid_d].into_iter().enumerate() {
-                    if model.streams[s] && occupied(grid, p, model.grids.threshold[s]) {
-                        self.batches[s].push(sample, p);
-                    }
+                let threshold = &model.grids.threshold;
+                if model.streams[0] && grid_p.at(p, 0) >= threshold[0] {
+                    self.batches[0].push(sample, p);
+                }
+                if model.streams[1] && grid_d.at(p, slice_d) >= threshold[1] {
+                    self.batches[1].push(sample, p);
                 }
                 let z = t * input.dir_cam.z;
                 if model.streams[2] && z < field.actor_far {
                     let q = model.actor_point(input.uv, z);
-                    if occupied(grid_a, q, model.grids.threshold[2]) {
+                    if grid_a.at(q, slice_a) >= threshold[2] {
                         self.batches[2].push(sample, q);
                     }
                 }

@@ -2,8 +2,11 @@
 
 pub mod composite;
 pub mod density_grid;
+pub mod depth;
 pub mod forward;
 pub mod image;
+pub mod query;
 pub mod rays;
+pub mod refined;
 pub mod sampler;
 pub mod views;

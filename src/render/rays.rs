@@ -33,6 +33,8 @@ pub struct View {
     pub focal: f32,
     /// Place in the pose and exposure trajectories.
     pub knots: Knots,
+    /// When it is, in [0, 1] over the video.
+    pub time: f32,
     /// Place in the code trajectories of each stream.
     pub code_knots: [Option<Knots>; 3],
 }
@@ -70,6 +72,7 @@ impl View {
             refinement,
             focal: rig[6],
             knots,
+            time,
             code_knots: field.codes.each_ref().map(|c| c.as_ref().map(|c| c.locate(time))),
         }
     }

@@ -2,7 +2,6 @@
 
 use glam::Vec3;
 
-use super::density_grid::DensityGrid;
 use super::rays::Ray;
 
 /// Most steps a ray takes through the density grids.
@@ -93,13 +92,4 @@ impl Sampler {
         }
         true
     }
-}
-
-/// Share of the light that a grid cell must be able to stop, over one cell, for its stream to be evaluated there.
-pub const OCCUPIED_ALPHA: f32 = 0.01;
-
-/// Whether a stream may have density at `p`.
-#[inline(always)]
-pub fn occupied(grid: &DensityGrid, p: Vec3, threshold: f32) -> bool {
-    grid.at(p) > threshold
 }

@@ -51,6 +51,8 @@ pub struct TrainConfig {
     pub grid_rate: f32,
     /// The density grids' densities times this place the samples; below 1 looks behind what may be fog.
     pub sharpness: f32,
+    /// Fraction of the schedule after which a stream is not evaluated where its grid is empty.
+    pub skip_from: f64,
     /// Share of a ray's samples spread evenly at the start, and at the end of the schedule.
     pub explore: [f32; 2],
     /// Seconds between checkpoints.
@@ -66,8 +68,8 @@ impl Default for TrainConfig {
             samples: 20,
             render_samples: 48,
             streams: StreamChoice::Auto,
-            static_until: 0.15,
-            table_rate: 2e-2,
+            static_until: 0.25,
+            table_rate: 3e-2,
             network_rate: 2e-3,
             exposure_rate: 1e-3,
             pose_rate: 1e-4,
@@ -76,6 +78,7 @@ impl Default for TrainConfig {
             grid_cells: 128.0,
             grid_rate: 0.05,
             sharpness: 0.3,
+            skip_from: 0.1,
             explore: [0.5, 0.1],
             checkpoint_seconds: 60.0,
         }

@@ -14,17 +14,29 @@ pub struct LossConfig {
     pub beta_min: f32,
     /// λ_u: price of dynamic and actor density (mean σ·δ over a ray).
     pub transient: f32,
+    /// Price of a pixel that is explained by the dynamic or the actor stream, in nats: the prior odds against it.
+    pub transient_opacity: [f32; 2],
     /// Distortion (Barron et al. 2022, mip-NeRF 360, eq. 15): pulls a ray's weight together.
     pub distortion: f32,
     /// Entropy of a ray's opacity per interval: surfaces are hard, air is empty.
     pub entropy: f32,
+    /// Curvature of inverse depth across a patch of pixels: what has no texture is taken to be flat.
+    pub smoothness: f32,
     /// Price of per-frame exposure away from none.
     pub exposure: f32,
 }
 
 impl Default for LossConfig {
     fn default() -> Self {
-        Self { beta_min: 0.03, transient: 0.01, distortion: 0.3, entropy: 0.0, exposure: 0.1 }
+        Self {
+            beta_min: 0.03,
+            transient: 0.01,
+            transient_opacity: [8.0, 6.0],
+            distortion: 0.3,
+            entropy: 0.0,
+            smoothness: 0.5,
+            exposure: 0.1,
+        }
     }
 }
 
@@ -48,6 +60,8 @@ pub struct ChunkGradient {
     pub samples: [StreamSamples; 3],
     /// With respect to the six exposure numbers of each ray.
     pub exposure: Vec<[f32; 6]>,
+    /// With respect to each ray's inverse depth.
+    inverse_depth: Vec<f32>,
 }
 
 /// The colour that a ray should have, and how it was exposed.
@@ -61,15 +75,25 @@ pub struct RayTarget {
     pub exposure: [f32; 6],
 }
 
+/// How a chunk's rays and samples are arranged.
+#[derive(Clone, Copy, Debug)]
+pub struct ChunkShape {
+    /// Samples per ray.
+    pub samples: usize,
+    /// Rays come in squares of `patch`² neighbours, row by row.
+    pub patch: usize,
+}
+
 /// Evaluates the loss of a traced chunk and fills `grad`. `scale` multiplies the whole gradient (1 / rays).
 pub fn backward(
     config: &LossConfig,
     chunk: &Chunk,
     targets: &[RayTarget],
-    count: usize,
+    shape: ChunkShape,
     scale: f32,
     grad: &mut ChunkGradient,
 ) -> ChunkLoss {
+    let count = shape.samples;
     let total = chunk.intervals.len();
     grad.weight.resize(total, [0.0; 3]);
     grad.sigma.resize(total, [0.0; 3]);
@@ -78,6 +102,7 @@ pub fn backward(
         s.reset(total);
     }
     let mut loss = ChunkLoss::default();
+    smoothness(config, chunk, targets, shape, scale, &mut grad.inverse_depth);
     for (r, target) in targets.iter().enumerate() {
         let ray = &chunk.rays[r];
         let range = r * count..(r + 1) * count;
@@ -111,10 +136,18 @@ pub fn backward(
                     grad.samples[s].rgb[k][c] = d_rgb[c] * w;
                 }
                 if s > 0 {
+                    g += scale * config.transient_opacity[s - 1];
                     g += d_beta * chunk.samples[s].beta[k];
                     grad.samples[s].beta[k] = d_beta * w;
                 }
                 grad.weight[k][s] = g;
+            }
+        }
+        let d_inverse = grad.inverse_depth[r] / ray.ray.dir_cam.z;
+        if d_inverse != 0.0 {
+            for k in range.clone() {
+                let d = d_inverse / chunk.intervals[k].t;
+                grad.weight[k] = grad.weight[k].map(|g| g + d);
             }
         }
         if config.distortion > 0.0 {
@@ -151,6 +184,61 @@ pub fn backward(
         }
     }
     loss
+}
+
+/// Contrast between neighbours at which a depth edge costs 1/e of what it costs on a plain surface.
+const EDGE_CONTRAST: f32 = 0.1;
+
+/// Relative curvature below which the price is quadratic rather than linear.
+const FLAT: f32 = 0.01;
+
+/// Gradient, with respect to each ray's inverse z-depth, of the curvature of inverse depth across a patch.
+///
+/// Inverse depth is linear in the image on any plane, whatever its slant, so a plane costs nothing. The curvature is
+/// taken relative to the inverse depth itself, and weighted down where the image has an edge.
+fn smoothness(
+    config: &LossConfig,
+    chunk: &Chunk,
+    targets: &[RayTarget],
+    shape: ChunkShape,
+    scale: f32,
+    grad: &mut Vec<f32>,
+) {
+    grad.clear();
+    grad.resize(targets.len(), 0.0);
+    let side = shape.patch;
+    if config.smoothness == 0.0 || side < 3 {
+        return;
+    }
+    let inverse: Vec<f32> = (0..targets.len())
+        .map(|r| {
+            let range = r * shape.samples..(r + 1) * shape.samples;
+            let sum = |k: usize| chunk.weighted[k].total() / chunk.intervals[k].t.max(1e-6);
+            range.map(sum).sum::<f32>() / chunk.rays[r].ray.dir_cam.z
+        })
+        .collect();
+    let contrast = |a: usize, b: usize| -> f32 {
+        (0..3).map(|c| (targets[a].rgb[c] - targets[b].rgb[c]).abs()).sum::<f32>() / 3.0
+    };
+    for first in (0..targets.len()).step_by(side * side) {
+        for line in 0..side {
+            for at in 0..side - 2 {
+                for (start, step) in [(line * side + at, 1), (at * side + line, side)] {
+                    let a = first + start;
+                    let [a, b, c] = [a, a + step, a + 2 * step];
+                    let size = inverse[b].max(1e-3);
+                    let curvature = (inverse[a] - 2.0 * inverse[b] + inverse[c]) / size;
+                    let edge = (-(contrast(a, b) + contrast(b, c)) / EDGE_CONTRAST).exp();
+                    // Charbonnier: √(κ² + flat²); its derivative is bounded by 1.
+                    let slope = curvature / (curvature * curvature + FLAT * FLAT).sqrt();
+                    let d = scale * config.smoothness * edge * slope / size;
+                    grad[a] += d;
+                    grad[b] -= 2.0 * d;
+                    grad[c] += d;
+                }
+            }
+        }
+    }
 }
 
 /// Adds the gradient of Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i with respect to the weights, in O(n).

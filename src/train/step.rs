@@ -10,10 +10,11 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::adam::{self, Moments, StepSize, TableState};
-use super::loss::{self, ChunkGradient, ChunkLoss, LossConfig, RayTarget};
+use super::loss::{self, ChunkGradient, ChunkLoss, ChunkShape, LossConfig, RayTarget};
 use super::pixels::PixelSet;
 use crate::field::Field;
 use crate::field::hashgrid::{Level, Row};
+use crate::render::density_grid::DensityGrid;
 use crate::render::forward::{Chunk, Grids, Model, RayInput};
 use crate::render::rays::View;
 use crate::render::sampler::Sampling;
@@ -25,6 +26,15 @@ const GROUPS: usize = 16;
 
 /// Rays whose activations are kept together: 32 × 24 samples are 1.2 MB, within one core's L2.
 pub const CHUNK_RAYS: usize = 32;
+
+/// Random cells of each density grid that a group looks at in a step.
+const REFRESH_CELLS: usize = 2 * TILE;
+
+/// How fast the density grids follow those looks.
+const REFRESH_RATE: f32 = 0.3;
+
+/// Pixels of a patch are 1, 2, 4 ... (this many powers of two) apart.
+const PATCH_STRIDES: usize = 4;
 
 /// What changes from step to step.
 #[derive(Clone, Copy, Debug)]
@@ -76,13 +86,37 @@ struct ChunkOutput {
 
 #[derive(Default)]
 struct StreamOutput {
-    /// Where the stream was evaluated, tile by tile.
-    positions: Vec<[[f32; TILE]; 3]>,
-    /// σ there.
-    sigma: Vec<f32>,
+    observed: Observed,
     /// Gradient of the encoding, `[level][capacity]`.
     encoding: Vec<Row>,
     capacity: usize,
+}
+
+/// Densities that were evaluated, for the density grid.
+#[derive(Default)]
+struct Observed {
+    /// Where, tile by tile.
+    positions: Vec<[[f32; TILE]; 3]>,
+    /// σ there.
+    sigma: Vec<f32>,
+    /// Slice of time that each falls into.
+    slices: Vec<u16>,
+}
+
+impl Observed {
+    fn clear(&mut self) {
+        self.positions.clear();
+        self.sigma.clear();
+        self.slices.clear();
+    }
+
+    fn tell(&self, grid: &mut DensityGrid, rate: f32) {
+        for (n, (sigma, slice)) in self.sigma.iter().zip(&self.slices).enumerate() {
+            let p = &self.positions[n / TILE];
+            let p = Vec3::new(p[0][n % TILE], p[1][n % TILE], p[2][n % TILE]);
+            grid.observe(p, usize::from(*slice), *sigma, rate);
+        }
+    }
 }
 
 /// Buffers of one group, kept from step to step.
@@ -93,6 +127,7 @@ struct Group {
     inputs: Vec<RayInput>,
     targets: Vec<RayTarget>,
     dense: Vec<f32>,
+    refreshed: [Observed; 3],
     loss: ChunkLoss,
     evaluations: usize,
 }
@@ -157,6 +192,7 @@ impl Optimiser {
 
     fn update(&mut self, field: &mut Field, grids: &mut Grids, plan: &StepPlan) {
         let Self { dense, tables, groups, outputs, gradient } = self;
+        let groups = &*groups;
         let arch = pulp::Arch::new();
         let rate = StepSize::new(plan.table_rate, plan.step);
         let outputs = &*outputs;
@@ -188,21 +224,15 @@ impl Optimiser {
                 }
                 scope.spawn(move |_| {
                     for o in outputs {
-                        let o = &o.streams[s];
-                        for (pos, sigma) in o.positions.iter().zip(o.sigma.chunks(TILE)) {
-                            for (lane, sigma) in sigma.iter().enumerate() {
-                                grid.observe(
-                                    Vec3::new(pos[0][lane], pos[1][lane], pos[2][lane]),
-                                    *sigma,
-                                    plan.grid_rate,
-                                );
-                            }
-                        }
+                        o.streams[s].observed.tell(grid, plan.grid_rate);
+                    }
+                    for group in groups {
+                        group.refreshed[s].tell(grid, REFRESH_RATE);
                     }
                 });
             }
             gradient.fill(0.0);
-            for group in &*groups {
+            for group in groups {
                 for (g, d) in gradient.iter_mut().zip(&group.dense) {
                     *g += d;
                 }
@@ -267,13 +297,14 @@ impl WithSimd for GroupPass<'_> {
             group.choose_rays(context, first_chunk + n);
             let Group { chunk, inputs, .. } = group;
             chunk.forward(simd, context.model, context.views, inputs, &context.plan.sampling);
-            let count = context.plan.sampling.count;
+            let shape =
+                ChunkShape { samples: context.plan.sampling.count, patch: context.plan.patch as usize };
             let scale = 1.0 / context.rays as f32;
             let l = loss::backward(
                 context.config,
                 &group.chunk,
                 &group.targets,
-                count,
+                shape,
                 scale,
                 &mut group.gradient,
             );
@@ -281,6 +312,7 @@ impl WithSimd for GroupPass<'_> {
             group.loss.squared += l.squared;
             group.backward(simd, context, output, first_chunk + n);
         }
+        group.refresh(simd, context, first_chunk);
     }
 }
 
@@ -291,21 +323,21 @@ impl Group {
         let pixels = context.pixels;
         let side = context.plan.patch;
         let mut rng = Rng::new(context.seed, context.plan.step, chunk as u64);
-        let mut corner = (0, 0);
+        let mut corner = (0, 0, 1);
         for k in 0..CHUNK_RAYS {
             let in_patch = k as u32 % (side * side);
             if in_patch == 0 {
                 corner = loop {
                     let frame = rng.below(pixels.frames.len());
                     if let Some(pixel) = pixels.pick(frame, rng.uniform()) {
-                        break (frame, pixel);
+                        break (frame, pixel, 1 << rng.below(PATCH_STRIDES));
                     }
                 };
             }
-            let (frame, first) = corner;
+            let (frame, first, stride) = corner;
             let camera = &pixels.frames[frame].camera;
-            let x = (first as u32 % camera.width + in_patch % side).min(camera.width - 1);
-            let y = (first as u32 / camera.width + in_patch / side).min(camera.height - 1);
+            let x = (first as u32 % camera.width + in_patch % side * stride).min(camera.width - 1);
+            let y = (first as u32 / camera.width + in_patch / side * stride).min(camera.height - 1);
             let pixel = match pixels.is_usable(frame, x + y * camera.width) {
                 true => (x + y * camera.width) as usize,
                 false => first,
@@ -339,8 +371,7 @@ impl Group {
         let count = context.plan.sampling.count;
         for s in 0..3 {
             let out = &mut output.streams[s];
-            out.positions.clear();
-            out.sigma.clear();
+            out.observed.clear();
             let batch = &mut chunk.batches[s];
             let (Some(net), Some(w)) = (&field.nets[s], model.weights(s)) else { continue };
             if batch.is_empty() {
@@ -354,8 +385,13 @@ impl Group {
             out.capacity = batch.len();
             out.encoding.resize(net.grid.levels.len() * out.capacity, Row::ZERO);
             net.encoding_gradient(batch, out.capacity, &mut out.encoding);
-            out.positions.extend_from_slice(batch.tiles());
-            out.sigma.extend(batch.sample.iter().map(|k| chunk.samples[s].sigma[*k as usize]));
+            let grid = &model.grids.streams[s];
+            out.observed.positions.extend_from_slice(batch.tiles());
+            for k in &batch.sample {
+                let view = &context.views[inputs[*k as usize / count].view as usize];
+                out.observed.sigma.push(chunk.samples[s].sigma[*k as usize]);
+                out.observed.slices.push(grid.slice(view.time) as u16);
+            }
             if let Some(code) = &field.codes[s] {
                 let gamma = &mut dense[r.code.clone()];
                 let mut per_ray = vec![0.0; inputs.len() * code.width];
@@ -375,6 +411,40 @@ impl Group {
         let refine = context.plan.pose_rate > 0.0 || context.plan.rig_rate > 0.0;
         if refine && (number as u64 + context.plan.step).is_multiple_of(4) {
             self.pose_gradient(context);
+        }
+    }
+
+    /// Evaluates random cells of the density grids, so that what was empty can fill again.
+    #[inline(always)]
+    fn refresh<S: Simd>(&mut self, simd: S, context: &Context, first_chunk: usize) {
+        let Self { chunk, refreshed, .. } = self;
+        let field = context.model.field;
+        let mut rng = Rng::new(context.seed, context.plan.step, u64::MAX - first_chunk as u64);
+        for (s, out) in refreshed.iter_mut().enumerate() {
+            out.clear();
+            let (true, Some(net), Some(w)) =
+                (context.plan.streams[s], &field.nets[s], context.model.weights(s))
+            else {
+                continue;
+            };
+            let grid = &context.model.grids.streams[s];
+            let batch = &mut chunk.batches[s];
+            batch.clear();
+            let mut codes = vec![0.0; REFRESH_CELLS * net.code];
+            for k in 0..REFRESH_CELLS {
+                let cell = rng.below(grid.sigma.len());
+                let u = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform());
+                let (p, time) = grid.point(cell, u, rng.uniform());
+                batch.push(k, p);
+                out.slices.push(grid.slice(time) as u16);
+                if let Some(code) = &field.codes[s] {
+                    let gamma = &field.weights[field.layout.streams[s].code.clone()];
+                    code.evaluate(gamma, code.locate(time), &mut codes[k * net.code..][..net.code]);
+                }
+            }
+            out.sigma.resize(REFRESH_CELLS, 0.0);
+            net.density(simd, &w, batch, |k| &codes[k as usize * net.code..], &mut out.sigma);
+            out.positions.extend_from_slice(batch.tiles());
         }
     }
 
@@ -425,11 +495,11 @@ impl WithSimd for TablePass<'_> {
         let Self { outputs, stream, level_index, level, table, state, rate } = self;
         for o in outputs {
             let o = &o.streams[stream];
-            if o.positions.is_empty() {
+            if o.observed.positions.is_empty() {
                 continue;
             }
             let grads = &o.encoding[level_index * o.capacity..][..o.capacity];
-            for (pos, g) in o.positions.iter().zip(grads.chunks(TILE)) {
+            for (pos, g) in o.observed.positions.iter().zip(grads.chunks(TILE)) {
                 level.scatter(&mut state.grad, pos, g);
             }
         }

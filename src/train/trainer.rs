@@ -24,6 +24,9 @@ const TEST_EVERY: u64 = 500;
 /// Every how many pixels, in both directions, a held-out frame is looked at while training.
 const TEST_STRIDE: u32 = 8;
 
+/// Share of the light that a cell of a density grid must be able to stop for its stream to be evaluated there.
+const OCCUPIED_ALPHA: f32 = 0.005;
+
 /// What the caller hears while training goes on.
 #[derive(Clone, Copy, Debug)]
 pub struct Progress {
@@ -127,6 +130,9 @@ impl Trainer {
             let fraction = self.fraction(budget);
             if !self.trained.progress.streams_settled && fraction >= self.config.train.static_until {
                 self.settle_streams();
+            }
+            if fraction >= self.config.train.skip_from {
+                self.trained.grids.skip_below(OCCUPIED_ALPHA);
             }
             let report = self.step(fraction)?;
             window.add(&report);

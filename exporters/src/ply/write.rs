@@ -22,20 +22,22 @@ pub struct PlyOptions {
 /// Bytes packed by one task: two such buffers per core stay in its second-level cache.
 const CHUNK_BYTES: usize = 256 * 1024;
 
-/// One property of a vertex, and where its values are.
+/// Values of neighbouring properties of a vertex. A whole block is copied at once: 32 feature columns one by one would
+/// pass over the rows 32 times.
 enum Source<'a> {
-    /// Component of a 3-vector.
-    Axis(&'a [[f32; 3]], usize),
-    /// Component of a colour.
-    Color(&'a [[u8; 3]], usize),
+    /// Three floats.
+    Vectors(&'a [[f32; 3]]),
+    /// Three bytes.
+    Colors(&'a [[u8; 3]]),
     /// An attribute.
-    Scalar(&'a AttributeValues),
-    /// Dimension `.1` of rows that are `.2` wide.
-    Feature(&'a [f32], usize, usize),
+    Scalars(&'a AttributeValues),
+    /// Rows of `.1` floats.
+    Features(&'a [f32], usize),
 }
 
-struct Column<'a> {
-    name: String,
+/// Neighbouring properties of one type.
+struct Block<'a> {
+    names: Vec<String>,
     source: Source<'a>,
 }
 
@@ -50,16 +52,16 @@ struct Column<'a> {
 /// `options.quality` says; `Io`.
 pub fn write_ply(path: &Path, geometry: &Geometry, options: &PlyOptions) -> Result<()> {
     geometry.validate()?;
-    let columns = columns(geometry, options)?;
-    let header = header(geometry, options, &columns);
-    let stride = columns.iter().map(Column::size).sum();
+    let blocks = blocks(geometry, options)?;
+    let header = header(geometry, options, &blocks);
+    let stride = blocks.iter().map(Block::size).sum();
     write_atomically(path, |file| {
         file.write_all(header.as_bytes())?;
         write_rows(file, geometry.positions.len(), stride, |first_row, rows| {
             let mut at = 0;
-            for column in &columns {
-                column.pack(first_row, rows, stride, at);
-                at += column.size();
+            for block in &blocks {
+                block.pack(first_row, rows, stride, at);
+                at += block.size();
             }
         })?;
         write_rows(file, geometry.triangles.len(), FACE_BYTES, |first_face, rows| {
@@ -74,38 +76,30 @@ pub fn write_ply(path: &Path, geometry: &Geometry, options: &PlyOptions) -> Resu
 /// One count byte and three 32-bit indices.
 const FACE_BYTES: usize = 13;
 
-fn columns<'a>(geometry: &'a Geometry, options: &PlyOptions) -> Result<Vec<Column<'a>>> {
-    let mut columns = Vec::new();
-    let mut push = |name: &str, source| columns.push(Column { name: name.to_owned(), source });
-    for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
-        push(name, Source::Axis(&geometry.positions, axis));
-    }
+fn blocks<'a>(geometry: &'a Geometry, options: &PlyOptions) -> Result<Vec<Block<'a>>> {
+    let mut blocks = Vec::new();
+    let mut push = |names: &[&str], source| {
+        blocks.push(Block { names: names.iter().map(|&name| name.to_owned()).collect(), source });
+    };
+    push(&["x", "y", "z"], Source::Vectors(&geometry.positions));
     if !geometry.normals.is_empty() {
-        for (axis, name) in ["nx", "ny", "nz"].into_iter().enumerate() {
-            push(name, Source::Axis(&geometry.normals, axis));
-        }
+        push(&["nx", "ny", "nz"], Source::Vectors(&geometry.normals));
     }
     if !geometry.colors.is_empty() {
-        for (channel, name) in ["red", "green", "blue"].into_iter().enumerate() {
-            push(name, Source::Color(&geometry.colors, channel));
-        }
+        push(&["red", "green", "blue"], Source::Colors(&geometry.colors));
     }
     let prefix = if options.cloudcompare { CLOUDCOMPARE_PREFIX } else { "" };
     if let Some(quality) = &options.quality {
-        push("quality", quality_source(geometry, quality)?);
+        push(&["quality"], quality_source(geometry, quality)?);
     }
     for attribute in &geometry.attributes {
-        push(&format!("{prefix}{}", attribute.name), Source::Scalar(&attribute.values));
+        push(&[&format!("{prefix}{}", attribute.name)], Source::Scalars(&attribute.values));
     }
     for features in &geometry.features {
-        for d in 0..features.dim {
-            push(
-                &format!("{prefix}{}", features.column(d)),
-                Source::Feature(&features.values, d, features.dim),
-            );
-        }
+        let names = (0..features.dim).map(|d| format!("{prefix}{}", features.column(d))).collect();
+        blocks.push(Block { names, source: Source::Features(&features.values, features.dim) });
     }
-    Ok(columns)
+    Ok(blocks)
 }
 
 fn quality_source<'a>(geometry: &'a Geometry, quality: &str) -> Result<Source<'a>> {
@@ -114,7 +108,7 @@ fn quality_source<'a>(geometry: &'a Geometry, quality: &str) -> Result<Source<'a
         return Err(Error::inconsistent(&geometry.name, reason));
     }
     match geometry.attributes.iter().find(|attribute| attribute.name == quality) {
-        Some(attribute) => Ok(Source::Scalar(&attribute.values)),
+        Some(attribute) => Ok(Source::Scalars(&attribute.values)),
         None => {
             let reason = format!("there is no attribute `{quality}` to write as `quality`");
             Err(Error::inconsistent(&geometry.name, reason))
@@ -122,7 +116,7 @@ fn quality_source<'a>(geometry: &'a Geometry, quality: &str) -> Result<Source<'a
     }
 }
 
-fn header(geometry: &Geometry, options: &PlyOptions, columns: &[Column]) -> String {
+fn header(geometry: &Geometry, options: &PlyOptions, blocks: &[Block]) -> String {
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     // The name comes from the caller; a line break in it would end the comment.
     let name = geometry.name.replace(|c: char| c.is_control(), " ");
@@ -136,8 +130,10 @@ fn header(geometry: &Geometry, options: &PlyOptions, columns: &[Column]) -> Stri
         header += &format!("comment divff quality {quality}\n");
     }
     header += &format!("element vertex {}\n", geometry.positions.len());
-    for column in columns {
-        header += &format!("property {} {}\n", column.type_name(), column.name);
+    for block in blocks {
+        for name in &block.names {
+            header += &format!("property {} {name}\n", block.type_name());
+        }
     }
     if !geometry.triangles.is_empty() {
         header += &format!("element face {}\n", geometry.triangles.len());
@@ -146,44 +142,49 @@ fn header(geometry: &Geometry, options: &PlyOptions, columns: &[Column]) -> Stri
     header + "end_header\n"
 }
 
-impl Column<'_> {
+impl Block<'_> {
     fn type_name(&self) -> &'static str {
         match self.source {
-            Source::Axis(..) | Source::Feature(..) | Source::Scalar(AttributeValues::F32(_)) => "float",
-            Source::Scalar(AttributeValues::I32(_)) => "int",
-            Source::Color(..) | Source::Scalar(AttributeValues::U8(_)) => "uchar",
+            Source::Vectors(_) | Source::Features(..) | Source::Scalars(AttributeValues::F32(_)) => "float",
+            Source::Scalars(AttributeValues::I32(_)) => "int",
+            Source::Colors(_) | Source::Scalars(AttributeValues::U8(_)) => "uchar",
         }
     }
 
+    /// Bytes of the block in a row.
     fn size(&self) -> usize {
-        if self.type_name() == "uchar" { 1 } else { 4 }
+        self.names.len() * if self.type_name() == "uchar" { 1 } else { 4 }
     }
 
     /// Puts the values of the rows from `first_row` at byte `at` of each `stride`-byte row of `rows`.
     fn pack(&self, first_row: usize, rows: &mut [u8], stride: usize, at: usize) {
         match self.source {
-            Source::Axis(vectors, axis) => {
-                pack(rows, stride, at, vectors[first_row..].iter().map(|v| v[axis].to_le_bytes()));
-            }
-            Source::Color(colors, channel) => {
-                pack(rows, stride, at, colors[first_row..].iter().map(|c| [c[channel]]));
-            }
-            Source::Scalar(AttributeValues::F32(values)) => {
+            Source::Vectors(vectors) => pack(rows, stride, at, vectors[first_row..].iter().map(vector_bytes)),
+            Source::Colors(colors) => pack(rows, stride, at, colors[first_row..].iter().copied()),
+            Source::Scalars(AttributeValues::F32(values)) => {
                 pack(rows, stride, at, values[first_row..].iter().map(|v| v.to_le_bytes()));
             }
-            Source::Scalar(AttributeValues::I32(values)) => {
+            Source::Scalars(AttributeValues::I32(values)) => {
                 pack(rows, stride, at, values[first_row..].iter().map(|v| v.to_le_bytes()));
             }
-            Source::Scalar(AttributeValues::U8(values)) => {
+            Source::Scalars(AttributeValues::U8(values)) => {
                 pack(rows, stride, at, values[first_row..].iter().map(|&v| [v]));
             }
-            Source::Feature(values, d, dim) => {
-                let of_dimension =
-                    values[first_row * dim..].chunks_exact(dim).map(|row| row[d].to_le_bytes());
-                pack(rows, stride, at, of_dimension);
+            Source::Features(values, dim) => {
+                for (row, values) in
+                    rows.chunks_exact_mut(stride).zip(values[first_row * dim..].chunks_exact(dim))
+                {
+                    for (to, value) in row[at..at + 4 * dim].as_chunks_mut::<4>().0.iter_mut().zip(values) {
+                        *to = value.to_le_bytes();
+                    }
+                }
             }
         }
     }
+}
+
+fn vector_bytes(vector: &[f32; 3]) -> [u8; 12] {
+    bytemuck::cast(vector.map(|v| v.to_bits().to_le()))
 }
 
 fn pack<const N: usize>(rows: &mut [u8], stride: usize, at: usize, values: impl Iterator<Item = [u8; N]>) {
@@ -192,23 +193,29 @@ fn pack<const N: usize>(rows: &mut [u8], stride: usize, at: usize, values: impl 
     }
 }
 
-/// Packs chunks of rows in parallel, a batch at a time, while the batch before is being written.
+/// Packs chunks of rows in parallel while the batch before is written.
 fn write_rows(
-    file: &mut impl Write,
+    file: &mut (impl Write + Send),
     rows: usize,
     stride: usize,
     pack: impl Fn(usize, &mut [u8]) + Sync,
 ) -> io::Result<()> {
     let rows_per_chunk = (CHUNK_BYTES / stride).max(1);
     let rows_per_batch = rows_per_chunk * 4 * rayon::current_num_threads();
-    let mut batch = vec![0; rows_per_batch.min(rows) * stride];
-    for first_row in (0..rows).step_by(rows_per_batch) {
-        let batch = &mut batch[..rows_per_batch.min(rows - first_row) * stride];
+    let pack_batch = |first_row: usize, batch: &mut Vec<u8>| {
+        batch.resize(rows_per_batch.min(rows.saturating_sub(first_row)) * stride, 0);
         batch
             .par_chunks_mut(rows_per_chunk * stride)
             .enumerate()
             .for_each(|(chunk, bytes)| pack(first_row + chunk * rows_per_chunk, bytes));
-        file.write_all(batch)?;
+    };
+    let (mut packed, mut next) = (Vec::new(), Vec::new());
+    pack_batch(0, &mut packed);
+    for first_row in (0..rows).step_by(rows_per_batch) {
+        let (written, ()) =
+            rayon::join(|| file.write_all(&packed), || pack_batch(first_row + rows_per_batch, &mut next));
+        written?;
+        std::mem::swap(&mut packed, &mut next);
     }
     Ok(())
 }

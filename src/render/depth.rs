@@ -1,0 +1,177 @@
+//! Depth of the persistent surface alone, through whatever moves in front of it, and how sure of it a ray is.
+
+use glam::Vec2;
+use pulp::{Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::composite::{self, Interval, Weighted};
+use super::forward::{Chunk, Model, RayInput};
+use super::rays::{View, pixel_directions};
+use super::refined::{reduced, refined_camera};
+use super::sampler::Sampling;
+use crate::scene::{Camera, Frame, Pose};
+
+/// Rays traced together.
+const CHUNK_RAYS: usize = 32;
+
+/// The persistent surface as one frame sees it; layers are `[height * width]` of `camera`.
+#[derive(Clone, Debug)]
+pub struct DepthMap {
+    /// Refined intrinsics at this map's resolution.
+    pub camera: Camera,
+    /// Refined camera-to-world, world units.
+    pub c2w: Pose,
+    /// Median depth along `c2w`'s z axis, world units; 0 where the ray meets nothing.
+    pub depth: Vec<f32>,
+    /// Share of the ray's light that ends within `spread` of that depth, 0–1: small in fog, across discontinuities
+    /// and where nothing is.
+    pub confidence: Vec<f32>,
+    /// Share of the light that moving things (dynamic, actor) take away in front of it, 0–1.
+    pub obstruction: Vec<f32>,
+}
+
+/// Traces the frame's rays, one per square of `stride` pixels. `spread` is in world units.
+pub fn persistent_depth(
+    model: &Model,
+    frame: &Frame,
+    sampling: &Sampling,
+    stride: u32,
+    spread: f64,
+) -> DepthMap {
+    let field = model.field;
+    let (camera, c2w) = refined_camera(field, frame);
+    let camera = reduced(&camera, stride);
+    let small = reduced(&frame.camera, stride);
+    let size = Vec2::new(frame.camera.width as f32, frame.camera.height as f32);
+    let inputs: Vec<RayInput> = pixel_directions(&small)
+        .into_iter()
+        .enumerate()
+        .map(|(n, dir_cam)| {
+            let at = Vec2::new((n as u32 % small.width) as f32, (n as u32 / small.width) as f32);
+            RayInput { view: 0, dir_cam, uv: (at + 0.5) * stride as f32 / size, jitter: 0.5 }
+        })
+        .collect();
+    let views = [View::new(field, frame)];
+    let spread = (spread / field.normalisation.scale) as f32;
+    let arch = pulp::Arch::new();
+    let rows: Vec<Vec<Traced>> = inputs
+        .par_chunks(CHUNK_RAYS * 16)
+        .map(|inputs| arch.dispatch(DepthPass { model, views: &views, inputs, sampling, spread }))
+        .collect();
+    let rays = rows.concat();
+    let to_world = |t: f32| (f64::from(t) * field.normalisation.scale) as f32;
+    DepthMap {
+        camera,
+        c2w,
+        depth: rays.iter().zip(&inputs).map(|(r, i)| to_world(r.median * i.dir_cam.z)).collect(),
+        confidence: rays.iter().map(|r| r.confidence).collect(),
+        obstruction: rays.iter().map(|r| r.obstruction).collect(),
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Traced {
+    median: f32,
+    confidence: f32,
+    obstruction: f32,
+}
+
+struct DepthPass<'a> {
+    model: &'a Model<'a>,
+    views: &'a [View],
+    inputs: &'a [RayInput],
+    sampling: &'a Sampling,
+    spread: f32,
+}
+
+impl WithSimd for DepthPass<'_> {
+    type Output = Vec<Traced>;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Vec<Traced> {
+        let Self { model, views, inputs, sampling, spread } = self;
+        let n = sampling.count;
+        let mut chunk = Chunk::default();
+        let mut alone = vec![Weighted::default(); n];
+        let mut out = Vec::with_capacity(inputs.len());
+        for inputs in inputs.chunks(CHUNK_RAYS) {
+            chunk.densities(simd, model, views, inputs, sampling);
+            for r in 0..inputs.len() {
+                let range = r * n..(r + 1) * n;
+                out.push(trace(
+                    &mut chunk.intervals[range.clone()],
+                    &chunk.weighted[range],
+                    &mut alone,
+                    spread,
+                ));
+            }
+        }
+        out
+    }
+}
+
+/// One ray: composites the persistent stream again as if it were alone.
+#[inline(always)]
+fn trace(intervals: &mut [Interval], mixed: &[Weighted], alone: &mut [Weighted], spread: f32) -> Traced {
+    let obstruction: f32 = mixed.iter().map(|w| w.weight[1] + w.weight[2]).sum();
+    for i in intervals.iter_mut() {
+        i.sigma[1] = 0.0;
+        i.sigma[2] = 0.0;
+    }
+    let left = composite::weights(intervals, alone);
+    let median = median(intervals, alone, 0.5 * (1.0 - left));
+    let confidence = intervals.iter().zip(alone.iter()).map(|(i, w)| {
+        let (from, to) = (i.t - 0.5 * i.delta, i.t + 0.5 * i.delta);
+        let inside = (to.min(median + spread) - from.max(median - spread)).max(0.0);
+        if i.delta > 0.0 { w.weight[0] * (inside / i.delta).min(1.0) } else { 0.0 }
+    });
+    Traced { median, confidence: confidence.sum(), obstruction: obstruction.min(1.0) }
+}
+
+/// Distance at which the weights first add up to `half`, linear inside the interval; 0 if there is no weight.
+#[inline(always)]
+fn median(intervals: &[Interval], weighted: &[Weighted], half: f32) -> f32 {
+    let mut sum = 0.0;
+    for (i, w) in intervals.iter().zip(weighted) {
+        let w = w.weight[0];
+        if w > 0.0 && sum + w >= half {
+            return i.t + i.delta * ((half - sum) / w - 0.5);
+        }
+        sum += w;
+    }
+    0.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wall(sigma: impl Fn(usize) -> [f32; 3]) -> Vec<Interval> {
+        (0..10).map(|k| Interval { sigma: sigma(k), delta: 0.1, t: 0.05 + 0.1 * k as f32 }).collect()
+    }
+
+    fn run(mut intervals: Vec<Interval>) -> Traced {
+        let mut mixed = vec![Weighted::default(); intervals.len()];
+        composite::weights(&intervals, &mut mixed);
+        let mut alone = mixed.clone();
+        trace(&mut intervals, &mixed, &mut alone, 0.1)
+    }
+
+    #[test]
+    fn the_wall_behind_a_hand_is_found_and_known_to_be_obstructed() {
+        let t =
+            run(wall(
+                |k| if k == 2 { [0.0, 0.0, 500.0] } else { [if k >= 7 { 500.0 } else { 0.0 }, 0.0, 0.0] },
+            ));
+        assert!((0.7..0.8).contains(&t.median), "{}", t.median);
+        assert!(t.confidence > 0.99 && t.obstruction > 0.99, "{} {}", t.confidence, t.obstruction);
+    }
+
+    #[test]
+    fn fog_and_emptiness_are_not_trusted() {
+        let fog = run(wall(|_| [2.0, 0.0, 0.0]));
+        assert!(fog.confidence < 0.4, "{}", fog.confidence);
+        let nothing = run(wall(|_| [0.0; 3]));
+        assert_eq!((nothing.median, nothing.confidence, nothing.obstruction), (0.0, 0.0, 0.0));
+    }
+}
