@@ -26,6 +26,10 @@ pub enum Preset {
 pub struct Config {
     /// Seed of everything random.
     pub seed: u64,
+    /// Seconds that training may take, over all sessions; the schedule then follows the clock and not
+    /// `train.steps`, so results differ from machine to machine.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub time_budget_s: Option<f64>,
     /// The training loop.
     pub train: TrainConfig,
     /// The loss.
@@ -99,6 +103,9 @@ impl Config {
             true => Ok(()),
             false => Err(ConfigError::Range { key, value, remedy }),
         };
+        let budget = self.time_budget_s.unwrap_or(1.0);
+        let ok = budget.is_finite() && budget > 0.0;
+        range("time_budget_s", budget.to_string(), ok, "must be a positive number of seconds")?;
         range("train.steps", t.steps.to_string(), t.steps > 0, "must be at least 1")?;
         range("train.rays", t.rays.to_string(), (1..=1 << 20).contains(&t.rays), "must be 1 to 1048576")?;
         let samples = (2..=256).contains(&t.samples);

@@ -1,0 +1,89 @@
+//! `synth` and `demo`.
+
+use std::fs;
+
+use divff::config::{Config, Preset};
+use divff::pipeline::{self, Outcome, RunFolder, RunOptions};
+use divff::synth::{SynthOptions, SynthSummary, generate};
+
+use super::args::{DemoArgs, SynthArgs};
+use super::error::CliError;
+use super::output::say;
+use super::progress::Reporter;
+use super::run::{open, summary};
+use super::stop::StopFlag;
+
+/// Seconds of training in the demo, so that everything is over in three minutes on two cores.
+const TRAINING_SECONDS: f64 = 75.0;
+
+/// `divff synth`.
+pub fn synth(args: &SynthArgs) -> Result<(), CliError> {
+    let options =
+        SynthOptions { frames: args.frames, width: args.width, height: args.height, seed: args.seed };
+    let made = generate(&options, &args.out)?;
+    say(format_args!("{}: {}", args.out.display(), described(&made)))
+}
+
+/// `divff demo`.
+pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
+    let (scene_path, run_path) = (args.out.join("scene"), args.out.join("run"));
+    let options = SynthOptions { seed: args.seed, ..SynthOptions::default() };
+    let mut reporter = Reporter::new(stop);
+    // A demo that was stopped goes on: its scene is complete as soon as it has its list of frames.
+    if scene_path.join("transforms.json").is_file() {
+        reporter.note(&format!("scene: {} is there already", scene_path.display()));
+    } else {
+        clear_half_made(&scene_path)?;
+        let made = generate(&options, &scene_path)?;
+        reporter.note(&format!("scene: {}: {}", scene_path.display(), described(&made)));
+    }
+    let scene = open(&scene_path, &reporter)?;
+    let mut config = Config::preset(Preset::Draft);
+    config.seed = args.seed;
+    config.time_budget_s = Some(TRAINING_SECONDS);
+    let outcome = pipeline::run(&scene, &config, &run_path, &RunOptions::default(), &mut reporter)?;
+    drop(reporter);
+    match outcome {
+        Outcome::Finished(metrics) => {
+            say(summary(&metrics))?;
+            say(opening(&RunFolder::new(run_path)))
+        }
+        Outcome::Stopped { step } => Err(CliError::Stopped { step }),
+    }
+}
+
+/// Removes the pictures of a scene whose making was cut off; nothing else is ever in this folder.
+fn clear_half_made(scene: &std::path::Path) -> Result<(), CliError> {
+    match fs::remove_dir_all(scene) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(CliError::Input {
+            path: scene.to_owned(),
+            what: format!("what an earlier demo left cannot be removed: {e}"),
+            remedy: "choose another --out",
+        }),
+        _ => Ok(()),
+    }
+}
+
+fn described(made: &SynthSummary) -> String {
+    format!(
+        "{} frames, {} things, {} of them moved, {} triangles that stay",
+        made.frames, made.instances, made.moves, made.persistent_triangles
+    )
+}
+
+/// What to open with what.
+fn opening(run: &RunFolder) -> String {
+    let map = run.map();
+    let rows = [
+        (run.report_path(), "report with pictures and figures: any web browser"),
+        (map.join("scene.glb"), "everything, in time: Blender (File > Import > glTF 2.0)"),
+        (map.join("persistent.ply"), "what stays, as a mesh: MeshLab, CloudCompare, Open3D"),
+        (map.join("points.npz"), "points with all attributes: numpy.load, Open3D"),
+        (run.views(), "rendered test frames, EXR with depth and streams: tev, Nuke, Blender"),
+    ];
+    let mut text = String::from("made:");
+    for (path, how) in rows.iter().filter(|(path, _)| path.exists()) {
+        text.push_str(&format!("\n  {}\n      {how}", path.display()));
+    }
+    text
+}

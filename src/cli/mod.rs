@@ -1,0 +1,50 @@
+//! The command line: arguments in, a few library calls, one message and an exit code out.
+
+mod args;
+mod demo;
+mod error;
+mod inspect;
+mod output;
+mod progress;
+mod run;
+mod settings;
+mod stop;
+
+use std::process::ExitCode;
+
+use args::{Cli, Command};
+use clap::Parser;
+use error::CliError;
+use stop::StopFlag;
+
+/// Parses the command line and does what it says.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    match dispatch(cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error}");
+            error.exit_code()
+        }
+    }
+}
+
+fn dispatch(cli: Cli) -> Result<(), CliError> {
+    if let Some(threads) = cli.threads {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads.into())
+            .build_global()
+            .map_err(|e| CliError::Start(e.to_string()))?;
+    }
+    // What can be stopped midway asks the flag; everything else is over before anyone could press a key.
+    let stop = StopFlag::install;
+    match &cli.command {
+        Command::Demo(args) => demo::demo(args, stop()?),
+        Command::Synth(args) => demo::synth(args),
+        Command::Run(args) => run::run(args, stop()?),
+        Command::Train(args) => run::train(args, stop()?),
+        Command::Render(args) => run::render(args, stop()?),
+        Command::Eval(args) => run::eval(args, stop()?),
+        Command::Inspect(args) => inspect::inspect(args),
+    }
+}

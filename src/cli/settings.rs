@@ -1,0 +1,109 @@
+//! From the command line to a [`Config`]: the preset, then the file, then single settings.
+
+use std::fs;
+
+use divff::config::{Config, ConfigError, Preset};
+
+use super::args::{PresetArg, SettingsArgs};
+use super::error::CliError;
+
+impl From<PresetArg> for Preset {
+    fn from(preset: PresetArg) -> Self {
+        match preset {
+            PresetArg::Draft => Self::Draft,
+            PresetArg::Standard => Self::Standard,
+            PresetArg::Fine => Self::Fine,
+        }
+    }
+}
+
+/// The resolved and checked settings.
+pub fn resolve(args: &SettingsArgs) -> Result<Config, CliError> {
+    let mut config = Config::preset(args.preset.into());
+    if let Some(path) = &args.config {
+        let text = fs::read_to_string(path).map_err(|e| CliError::Input {
+            path: path.clone(),
+            what: e.to_string(),
+            remedy: "name a TOML file with settings",
+        })?;
+        config = config.overlaid(&text, &path.display().to_string())?;
+    }
+    for setting in &args.set {
+        config = set(&config, setting)?;
+    }
+    if let Some(seed) = args.seed {
+        config.seed = seed;
+    }
+    if let Some(budget) = args.time_budget {
+        config.time_budget_s = Some(budget.as_secs_f64());
+    }
+    config.validate()?;
+    Ok(config)
+}
+
+/// Lays `key=value` over the settings. A value that is not TOML is taken as a string: `train.streams=static`.
+fn set(config: &Config, setting: &str) -> Result<Config, CliError> {
+    let Some((key, value)) = setting.split_once('=') else {
+        return Err(CliError::Usage {
+            option: format!("--set {setting}"),
+            what: "there is no `=` in it".into(),
+            remedy: "write it as --set train.steps=9000",
+        });
+    };
+    let (key, value) = (key.trim(), value.trim());
+    let origin = format!("--set {setting}");
+    let as_is = format!("{key} = {value}");
+    let text = match as_is.parse::<toml::Table>() {
+        Ok(_) => as_is,
+        Err(_) => format!("{key} = {}", toml::Value::String(value.to_owned())),
+    };
+    config.overlaid(&text, &origin).map_err(|error| match error {
+        // The parser's picture of the line only repeats what was typed.
+        ConfigError::Syntax { origin, message } => {
+            let message = message.lines().last().unwrap_or_default().to_owned();
+            CliError::from(ConfigError::Syntax { origin, message })
+        }
+        other => other.into(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use divff::train::StreamChoice;
+
+    use super::*;
+
+    #[test]
+    fn values_are_toml_or_bare_strings() {
+        let config = Config::default();
+        assert_eq!(set(&config, "train.steps=12").unwrap().train.steps, 12);
+        assert_eq!(set(&config, "train.streams=static").unwrap().train.streams, StreamChoice::Static);
+        assert_eq!(set(&config, "train.streams=\"all\"").unwrap().train.streams, StreamChoice::All);
+        assert_eq!(set(&config, "train.explore=[0.25, 0.5]").unwrap().train.explore, [0.25, 0.5]);
+    }
+
+    #[test]
+    fn mistakes_name_the_option() {
+        for wrong in ["train.steps", "train.stepz=1", "train.steps=many", "train=1", "=1"] {
+            let message = set(&Config::default(), wrong).unwrap_err().to_string();
+            assert!(message.contains(&format!("--set {wrong}")), "{message}");
+            assert!(!message.contains('\n'), "{message}");
+        }
+    }
+
+    #[test]
+    fn single_settings_win_over_the_file_and_the_file_over_the_preset() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("c.toml");
+        fs::write(&path, "seed = 3\n[train]\nsteps = 10\nrays = 64\n").unwrap();
+        let args = SettingsArgs {
+            preset: PresetArg::Draft,
+            config: Some(path),
+            set: vec!["train.rays=128".into()],
+            seed: None,
+            time_budget: None,
+        };
+        let config = resolve(&args).unwrap();
+        assert_eq!((config.seed, config.train.steps, config.train.rays), (3, 10, 128));
+    }
+}

@@ -1,0 +1,101 @@
+//! Renders frames of a run to files, and measures the result.
+
+use std::path::Path;
+use std::time::Instant;
+
+use super::folder::create_writable;
+use super::metrics::{RunMetrics, peak_rss_mb, skipped_in_training};
+use super::{Cost, Event, Observer, PipelineError, RunFolder};
+use crate::config::Config;
+use crate::eval::{self, RenderedView};
+use crate::render::forward::Model;
+use crate::render::image::{RenderedFrame, render};
+use crate::render::views::{Layer, quantised, write_view};
+use crate::scene::{Frame, Scene, Split};
+use crate::train::Trained;
+
+/// Layers of the files in `views/`.
+const VIEW_LAYERS: [Layer; 3] = [Layer::Rgb, Layer::Depth, Layer::Stream];
+
+/// Renders `frames` with the streams asked for, into `<stem>.png` and `<stem>.exr` in `out`.
+///
+/// Returns the number of frames written: fewer than asked for if the observer said stop.
+///
+/// # Errors
+/// A file cannot be written.
+pub fn render_views(
+    trained: &Trained,
+    config: &Config,
+    frames: &[&Frame],
+    streams: [bool; 3],
+    layers: &[Layer],
+    out: &Path,
+    observer: &mut dyn Observer,
+) -> Result<usize, PipelineError> {
+    create_writable(out)?;
+    let model = Model::new(&trained.field, &trained.grids, streams);
+    let sampling = config.train.render_sampling();
+    for (done, frame) in frames.iter().enumerate() {
+        if observer.stop() {
+            return Ok(done);
+        }
+        let image = render(&model, frame, &sampling, 1);
+        write_view(out, &frame.stem, &image, &frame.camera, &frame.c2w, layers, Vec::new())?;
+        observer.event(&Event::Views { done: done + 1, total: frames.len() });
+    }
+    Ok(frames.len())
+}
+
+/// Renders the test frames into `views/`, and compares them and the meshes in `map/` with the scene's truth.
+///
+/// `cost` is what the stages before took. `None` if the observer said stop.
+///
+/// # Errors
+/// The truth cannot be read, a view cannot be written.
+pub fn evaluate(
+    scene: &Scene,
+    trained: &Trained,
+    config: &Config,
+    run: &RunFolder,
+    mut cost: Cost,
+    observer: &mut dyn Observer,
+) -> Result<Option<RunMetrics>, PipelineError> {
+    let start = Instant::now();
+    create_writable(&run.views())?;
+    let model = Model::new(&trained.field, &trained.grids, [true; 3]);
+    let sampling = config.train.render_sampling();
+    let total = scene.frames.iter().filter(|f| f.split == Split::Test).count();
+    let mut done = 0;
+    let mut quality = eval::evaluate_images(scene, |frame| {
+        if observer.stop() {
+            return Ok(None);
+        }
+        let image = render(&model, frame, &sampling, 1);
+        write_view(&run.views(), &frame.stem, &image, &frame.camera, &frame.c2w, &VIEW_LAYERS, Vec::new())?;
+        done += 1;
+        observer.event(&Event::Views { done, total });
+        Ok(Some(measurable(image)))
+    })?;
+    if observer.stop() {
+        return Ok(None);
+    }
+    if run.map().is_dir() {
+        eval::evaluate_geometry(scene, &run.map(), &mut quality)?;
+    } else {
+        quality.absent.insert("persistent".into(), "the run has no map".into());
+    }
+    cost.set_training(&trained.progress);
+    cost.eval_seconds = Some(start.elapsed().as_secs_f64());
+    cost.peak_rss_mb = peak_rss_mb();
+    let skipped = skipped_in_training(&trained.progress, trained.field.shape.streams);
+    Ok(Some(RunMetrics { quality, cost, skipped }))
+}
+
+/// What is measured of a frame: the colours as 8-bit PNGs hold them.
+fn measurable(image: RenderedFrame) -> RenderedView {
+    RenderedView {
+        rgb: quantised(&image.rgb).as_chunks::<3>().0.to_vec(),
+        depth: Some(image.depth),
+        streams: Some(std::array::from_fn(|s| image.opacity.iter().map(|o| o[s]).collect())),
+    }
+}

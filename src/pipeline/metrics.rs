@@ -1,0 +1,118 @@
+//! `metrics.json`: how good the result is, and what it took.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::eval::Metrics;
+use crate::train::checkpoint::TrainingState;
+
+/// Everything in `metrics.json`; what was not measured is left out.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct RunMetrics {
+    /// How good the result is.
+    #[serde(flatten)]
+    pub quality: Metrics,
+    /// What it took.
+    #[serde(flatten)]
+    pub cost: Cost,
+    /// What was skipped and the work that it saved.
+    #[serde(default)]
+    pub skipped: BTreeMap<String, serde_json::Value>,
+}
+
+/// What a run took.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Cost {
+    /// Seconds of training, over all sessions.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub train_seconds: Option<f64>,
+    /// Seconds from the field to geometry in memory.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub extract_seconds: Option<f64>,
+    /// Seconds of writing the map.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub export_seconds: Option<f64>,
+    /// Seconds of rendering and comparing the test frames and the meshes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub eval_seconds: Option<f64>,
+    /// Most memory that the program held at once, MB; unknown where the system does not tell.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub peak_rss_mb: Option<f64>,
+    /// Training steps.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub train_steps: Option<u64>,
+    /// Field evaluations, forward and backward, per second of training.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub samples_per_second: Option<f64>,
+    /// Rays per second of training.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rays_per_second: Option<f64>,
+}
+
+impl Cost {
+    /// Fills in what training took.
+    pub fn set_training(&mut self, state: &TrainingState) {
+        let seconds = state.seconds.max(1e-9);
+        self.train_seconds = Some(state.seconds);
+        self.train_steps = Some(state.step);
+        self.samples_per_second = Some(state.evaluations as f64 / seconds);
+        self.rays_per_second = Some(state.rays as f64 / seconds);
+    }
+}
+
+/// What empty-space skipping and settling the streams saved while training.
+pub fn skipped_in_training(state: &TrainingState, streams: [bool; 3]) -> BTreeMap<String, serde_json::Value> {
+    let mut skipped = BTreeMap::new();
+    let saved = state.candidates.saturating_sub(state.evaluations);
+    skipped.insert("train_field_evaluations".to_owned(), saved.into());
+    if state.candidates > 0 {
+        let share = saved as f64 / state.candidates as f64;
+        skipped.insert("train_field_evaluations_share".to_owned(), share.into());
+    }
+    let absent: Vec<&str> =
+        crate::field::Stream::ALL.iter().filter(|s| !streams[**s as usize]).map(|s| s.name()).collect();
+    skipped.insert("streams".to_owned(), absent.into());
+    skipped
+}
+
+/// The metrics in a file, if there are any that can be read.
+pub fn read(path: &Path) -> Option<RunMetrics> {
+    serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+}
+
+/// Most memory that this process held at once, MB: `VmHWM` of Linux; `None` elsewhere.
+pub fn peak_rss_mb() -> Option<f64> {
+    parse_peak(&std::fs::read_to_string("/proc/self/status").ok()?)
+}
+
+fn parse_peak(status: &str) -> Option<f64> {
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
+    let kib: f64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib * 1024.0 / 1e6)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_peak_is_read_from_the_status_file() {
+        assert_eq!(parse_peak("Name:\tx\nVmHWM:\t   1000 kB\nVmRSS:\t 1 kB\n"), Some(1.024));
+        assert_eq!(parse_peak("Name:\tx\n"), None);
+        assert_eq!(parse_peak("VmHWM:\tmany kB\n"), None);
+    }
+
+    #[test]
+    fn metrics_come_back_from_json() {
+        let mut metrics = RunMetrics::default();
+        metrics.quality.psnr = Some(21.5);
+        metrics.cost.train_seconds = Some(12.0);
+        metrics.skipped.insert("streams".into(), vec!["actor"].into());
+        let json = serde_json::to_string(&metrics).unwrap();
+        assert!(json.contains("\"psnr\":21.5,\"train_seconds\":12.0"), "{json}");
+        assert_eq!(serde_json::from_str::<RunMetrics>(&json).unwrap(), metrics);
+    }
+}

@@ -1,0 +1,137 @@
+//! A whole run: train → map → views → measures → report, each stage a call that also stands by itself.
+//!
+//! A run lives in a [`RunFolder`]. Every file appears complete or not at all, and training goes on where it was
+//! stopped.
+
+mod error;
+mod evaluate;
+mod fingerprint;
+pub mod folder;
+pub mod log;
+pub mod metrics;
+mod train;
+
+use std::path::PathBuf;
+
+pub use error::PipelineError;
+pub use evaluate::{evaluate, render_views};
+pub use fingerprint::fingerprint;
+pub use folder::{RunFolder, RunRecord};
+pub use metrics::{Cost, RunMetrics};
+pub use train::train;
+
+use crate::config::Config;
+use crate::scene::Scene;
+use crate::train::Progress;
+
+/// Parts of a run, in order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Stage {
+    /// The field learns the scene.
+    Training,
+    /// Meshes and points are taken from the field.
+    Mapping,
+    /// The map is written.
+    Exporting,
+    /// Test frames are rendered and everything is compared with the truth.
+    Evaluating,
+    /// `report.html` is written.
+    Reporting,
+}
+
+/// What an [`Observer`] hears.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub enum Event<'a> {
+    /// A stage begins.
+    Stage(Stage),
+    /// Training goes on from a checkpoint.
+    Resuming {
+        /// Steps taken so far.
+        step: u64,
+        /// Seconds spent so far.
+        seconds: f64,
+    },
+    /// Training had been finished earlier.
+    AlreadyTrained {
+        /// Steps it took.
+        step: u64,
+    },
+    /// Training moves on.
+    Training(&'a Progress),
+    /// Frames are being rendered.
+    Views {
+        /// Frames done.
+        done: usize,
+        /// Frames in all.
+        total: usize,
+    },
+}
+
+/// Who follows a run: the command line's progress bars, or `()` for nobody.
+pub trait Observer {
+    /// Hears what happens.
+    fn event(&mut self, event: &Event);
+
+    /// Whether to stop at the next opportunity; what is done by then is kept.
+    fn stop(&self) -> bool;
+}
+
+impl Observer for () {
+    fn event(&mut self, _: &Event) {}
+
+    fn stop(&self) -> bool {
+        false
+    }
+}
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome {
+    /// Everything is there.
+    Finished(Box<RunMetrics>),
+    /// The observer said stop; the same call goes on from here.
+    Stopped {
+        /// Training steps taken by then.
+        step: u64,
+    },
+}
+
+/// What a run is told beside its settings.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RunOptions {
+    /// Throw away what the folder holds and start over.
+    pub fresh: bool,
+}
+
+/// Trains on `scene`, builds and writes the map, renders and measures the test frames, and writes the report.
+///
+/// Stages whose results are there already are not repeated by training; maps, views and measures always are, since
+/// their settings may have changed.
+///
+/// # Errors
+/// [`PipelineError`]: the first thing that went wrong. What was finished before it stays.
+pub fn run(
+    scene: &Scene,
+    config: &Config,
+    out: impl Into<PathBuf>,
+    options: &RunOptions,
+    observer: &mut dyn Observer,
+) -> Result<Outcome, PipelineError> {
+    let run = RunFolder::new(out);
+    let cost = Cost::default();
+    observer.event(&Event::Stage(Stage::Training));
+    let trained = train(scene, config, &run, options.fresh, observer)?;
+    let stopped = Outcome::Stopped { step: trained.progress.step };
+    if !trained.progress.finished {
+        return Ok(stopped);
+    }
+    observer.event(&Event::Stage(Stage::Evaluating));
+    let Some(metrics) = evaluate(scene, &trained, config, &run, cost, observer)? else {
+        return Ok(stopped);
+    };
+    folder::write_json(&run.metrics_path(), &metrics)?;
+    observer.event(&Event::Stage(Stage::Reporting));
+    crate::report::write(&run, scene)?;
+    Ok(Outcome::Finished(Box::new(metrics)))
+}
