@@ -16,9 +16,9 @@ pub struct LossConfig {
     pub transient: f32,
     /// Distortion (Barron et al. 2022, mip-NeRF 360, eq. 15): pulls a ray's weight together.
     pub distortion: f32,
-    /// Entropy of a ray's opacity per interval: surfaces are hard, air is empty.
+    /// Softness Σ_k T_k α_k (1 − α_k) of a ray: surfaces are hard, air is empty.
     pub entropy: f32,
-    /// Price of per-frame exposure away from none.
+    /// Price of per-frame exposure away from none: times half the squares of its six numbers.
     pub exposure: f32,
 }
 
@@ -117,13 +117,25 @@ pub fn backward(
                 grad.weight[k][s] = g;
             }
         }
+        let exposure = target.exposure.iter().map(|e| e * e).sum::<f32>();
+        let mut extra = 0.5 * config.exposure * exposure;
         if config.distortion > 0.0 {
-            distortion(
-                &chunk.intervals[range.clone()],
-                &chunk.weighted[range.clone()],
-                scale * config.distortion,
-                &mut grad.weight[range.clone()],
-            );
+            extra += config.distortion
+                * distortion(
+                    &chunk.intervals[range.clone()],
+                    &chunk.weighted[range.clone()],
+                    scale * config.distortion,
+                    &mut grad.weight[range.clone()],
+                );
+        }
+        if config.entropy > 0.0 {
+            // Σ_k T α (1 − α) = Σ_k w (1 − α), w the weight of all streams: here its gradient by w.
+            for (w, g) in chunk.weighted[range.clone()].iter().zip(&mut grad.weight[range.clone()]) {
+                extra += config.entropy * w.total() * w.pass();
+                for g in g {
+                    *g += scale * config.entropy * w.pass();
+                }
+            }
         }
         crate::render::composite::backward(
             &chunk.intervals[range.clone()],
@@ -136,31 +148,32 @@ pub fn backward(
         let d_transient = scale * config.transient;
         for k in range {
             let delta = chunk.intervals[k].delta;
+            let mut direct = 0.0;
             if config.entropy > 0.0 {
+                // And by 1 − α = e^(−δΣ).
                 let w = &chunk.weighted[k];
-                let alpha = (w.total() / w.transmittance.max(1e-6)).clamp(0.0, 1.0);
-                // d/dσ of α(1−α), weighted by the light that arrives: hard surfaces or nothing.
-                let d =
-                    scale * config.entropy * w.transmittance * (1.0 - 2.0 * alpha) * (1.0 - alpha) * delta;
-                grad.sigma[k][0] += d;
+                direct = -scale * config.entropy * w.total() * w.pass() * delta;
             }
             for s in 0..3 {
-                let extra = if s > 0 { d_transient * delta } else { 0.0 };
-                grad.samples[s].sigma[k] = grad.sigma[k][s] + extra;
+                let transient = if s > 0 { d_transient * delta } else { 0.0 };
+                grad.samples[s].sigma[k] = grad.sigma[k][s] + direct + transient;
             }
+            let [_, dynamic, actor] = chunk.intervals[k].sigma;
+            extra += config.transient * delta * (dynamic + actor);
         }
+        loss.total += f64::from(extra);
     }
     loss
 }
 
-/// Adds the gradient of Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i with respect to the weights, in O(n).
-fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &mut [[f32; 3]]) {
+/// Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i; adds its gradient with respect to the weights times `scale`, in O(n).
+fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &mut [[f32; 3]]) -> f32 {
     let (mut all, mut all_t) = (0.0, 0.0);
     for (i, w) in intervals.iter().zip(weighted) {
         all += w.total();
         all_t += w.total() * i.t;
     }
-    let (mut before, mut before_t) = (0.0, 0.0);
+    let (mut before, mut before_t, mut sum) = (0.0, 0.0, 0.0);
     for ((i, w), g) in intervals.iter().zip(weighted).zip(grad) {
         let (w, wt) = (w.total(), w.total() * i.t);
         let (after, after_t) = (all - before - w, all_t - before_t - wt);
@@ -168,7 +181,10 @@ fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &
         for g in g.iter_mut() {
             *g += scale * d;
         }
+        // A quadratic form is half the weights times its gradient.
+        sum += 0.5 * w * d;
         before += w;
         before_t += wt;
     }
+    sum
 }

@@ -20,6 +20,11 @@ use crate::render::sampler::Sampling;
 use crate::rng::Rng;
 use crate::simd::TILE;
 
+#[cfg(test)]
+mod gradient_tests;
+#[cfg(test)]
+mod reference;
+
 /// Groups that a step is divided into; fixed, so that sums are taken in the same order on any machine.
 const GROUPS: usize = 16;
 
