@@ -13,4 +13,6 @@ pub mod refined;
 pub mod sampler;
 #[cfg(test)]
 mod sampler_tests;
+#[cfg(test)]
+pub(crate) mod testing;
 pub mod views;
