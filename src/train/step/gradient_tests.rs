@@ -70,7 +70,7 @@ fn trace(seed: u64) -> Traced {
     plan.pose_rate = 1.0;
     plan.rig_rate = 1.0;
     // Large enough that one per cent of a term is more than the tolerance.
-    let config = LossConfig { transient: 0.1, entropy: 0.5, exposure: 100.0, ..config.loss };
+    let config = LossConfig { transient: 0.1, distortion: 10.0, entropy: 0.5, exposure: 100.0, ..config.loss };
     let mut traced =
         Traced { field, pixels, config, plan, group: Group::default(), tables: Default::default() };
     traced.run(&grids, seed);
@@ -307,9 +307,10 @@ fn a_group_without_gradient_is_found() {
 #[test]
 fn a_term_that_is_off_by_one_per_cent_is_found() {
     let traced = trace(1);
-    let wrong: [fn(&mut LossConfig); 5] = [
+    let wrong: [fn(&mut LossConfig); 6] = [
         |c| c.beta_min *= 1.01,
         |c| c.transient *= 1.01,
+        |c| c.transient_opacity[0] *= 1.01,
         |c| c.distortion *= 1.01,
         |c| c.entropy *= 1.01,
         |c| c.exposure *= 1.01,
