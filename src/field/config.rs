@@ -69,7 +69,7 @@ impl Default for FieldConfig {
             coarsest: 8.0,
             finest: 64.0,
             log2_rows: 16,
-            knots: 0,
+            knots: 70,
             ..dynamic.clone()
         };
         Self { persistent, dynamic, actor, actor_reach: 0.25, near: 0.015 }

@@ -123,6 +123,8 @@ pub struct MapConfig {
     pub depth_samples: usize,
     /// Least fused weight of a voxel, in confident views from the mean distance.
     pub min_views: f32,
+    /// Frames nearest in time from which the dynamic surface of a time is fused.
+    pub dynamic_views: usize,
     /// Truncation of the signed distance, voxels.
     pub truncation_voxels: f64,
     /// A density surface lies where this many voxels of it stop half of the light.
@@ -147,7 +149,8 @@ impl Default for MapConfig {
             points: 200_000,
             depth_rays: 4_000_000,
             depth_samples: 32,
-            min_views: 2.0,
+            min_views: 0.5,
+            dynamic_views: 12,
             truncation_voxels: 4.0,
             opaque_voxels: 2.0,
             min_component_voxels: 12.0,

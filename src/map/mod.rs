@@ -14,6 +14,8 @@ mod persistent;
 mod place;
 mod points;
 mod surface;
+#[cfg(test)]
+mod tests;
 mod times;
 mod views;
 mod write;

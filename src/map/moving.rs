@@ -1,28 +1,36 @@
 //! What changes: the dynamic surface and the actor's, at each of the times asked for.
+//!
+//! These streams are seen for moments and from few sides, so their density is spread along the rays and no iso-level
+//! of it is a surface. Their median depth is: it is rendered from the frames nearest in time (the actor: from its own
+//! frame alone), where the stream takes most of the light, and fused.
 
 use divff_exporters::Geometry;
-use glam::{DVec3, Vec2, Vec3, Vec3A};
+use glam::{DVec2, Vec2, Vec3, Vec3A};
+use rayon::prelude::*;
 
 use super::MapObject;
 use super::build::{Builder, Context, Stage};
 use super::error::MapError;
-use super::persistent::{HALF, opacity, opacity_grid};
-use super::surface::{Surface, field_colours, gradient_normals};
+use super::surface::{Surface, field_colours};
 use super::times::Moment;
 use super::views::{self, SeenFrame};
-use crate::extract::clean::smooth;
+use crate::extract::clean::{smooth, vertex_normals};
+use crate::extract::tsdf::{DepthFrame, TsdfOptions, TsdfVolume};
 use crate::extract::visibility::ViewFrame;
-use crate::extract::{GridSpec, SparseGrid, march};
 use crate::field::Stream;
+use crate::render::depth::{DepthMap, stream_depth};
 use crate::render::query::Query;
 use crate::render::refined::refined_camera;
-use crate::scene::{Camera, Pose};
+use crate::scene::{Camera, Frame, Pose};
+use crate::simd::one_minus_exp_neg;
 
-/// A block (729 corners) in which more corners than this change sides has changed; fewer are the trembling of a code
-/// from frame to frame at a surface that stays.
-const CHANGED_CORNERS: usize = 24;
+/// A pixel shows a stream where it takes more than this share of the light.
+const SHOWN: f32 = 0.5;
 
-/// Extracts the dynamic surface at every moment; where no block of its grid changed, the geometry is shared.
+/// The dynamic surface has changed where the opacity of a cell of the density grid differs by more than this.
+const CHANGED: f32 = 0.15;
+
+/// Extracts the dynamic surface at every moment; where no cell's opacity changed, the geometry is shared.
 pub(super) fn extract_dynamic(
     b: &mut Builder,
     seen: &[SeenFrame],
@@ -32,35 +40,31 @@ pub(super) fn extract_dynamic(
         return Ok(());
     }
     let views: Vec<ViewFrame> = seen.iter().map(SeenFrame::moving_view).collect();
-    // The last grid that was marched, and the geometry that came of it, if any.
-    let mut last: Option<(SparseGrid, Option<usize>, String)> = None;
+    let cells = occupied_cells(&b.cx);
+    // What was last extracted: opacities, geometry if there is any, name.
+    let mut last: Option<(Vec<f32>, Option<usize>, String)> = None;
     for (n, moment) in moments.iter().enumerate() {
         b.report(Stage::Dynamic, n, moments.len());
         let object = object(Stream::Dynamic, moment);
-        let Some(query) = Query::new(&b.cx.model, Stream::Dynamic, moment.frame.time as f32) else {
-            continue;
-        };
-        let grid = opacity_grid(&b.cx, &query)?;
-        if let Some((before, geometry, of)) = &last {
-            if !changed(before, &grid) {
-                let (geometry, of) = (*geometry, of.clone());
-                drop(query);
-                b.skip(object.name(), format!("nothing changed since {of}; its geometry is shared"));
-                b.map.objects.extend(geometry.map(|geometry| MapObject { geometry, ..object }));
-                continue;
-            }
-        }
-        let geometry = dynamic_geometry(&b.cx, &query, &grid, &object.name(), &views)?;
-        drop(query);
         let name = object.name();
+        let now = opacities(&b.cx, moment, &cells);
+        if let Some((before, geometry, of)) = &last
+            && before.iter().zip(&now).all(|(a, b)| (a - b).abs() <= CHANGED)
+        {
+            b.skip(name, format!("nothing changed since {of}; its geometry is shared"));
+            b.map.objects.extend(geometry.map(|geometry| MapObject { geometry, ..object }));
+            continue;
+        }
+        let frames = nearest(&b.cx, moment.frame);
+        let geometry = fused(&b.cx, Stream::Dynamic, moment, &frames, &name, &views)?;
         let added = b.add(object, geometry);
-        last = Some((grid, added.then(|| b.map.geometries.len() - 1), name));
+        last = Some((now, added.then(|| b.map.geometries.len() - 1), name));
     }
     b.report(Stage::Dynamic, moments.len(), moments.len());
     Ok(())
 }
 
-/// Extracts the actor at every moment, in the camera's coordinates, as far as its own frame sees it.
+/// Extracts the actor at every moment, as far as its own frame sees it.
 pub(super) fn extract_actor(b: &mut Builder, moments: &[Moment]) -> Result<(), MapError> {
     if !b.has(Stream::Actor) {
         return Ok(());
@@ -68,7 +72,9 @@ pub(super) fn extract_actor(b: &mut Builder, moments: &[Moment]) -> Result<(), M
     for (n, moment) in moments.iter().enumerate() {
         b.report(Stage::Actor, n, moments.len());
         let object = object(Stream::Actor, moment);
-        let geometry = actor_geometry(&b.cx, moment, &object.name())?;
+        let seen = views::look(&b.cx, moment.frame, stride(&b.cx, &[moment.frame]))?;
+        let frames = [moment.frame];
+        let geometry = fused(&b.cx, Stream::Actor, moment, &frames, &object.name(), &[seen.moving_view()])?;
         b.add(object, geometry);
     }
     b.report(Stage::Actor, moments.len(), moments.len());
@@ -84,155 +90,87 @@ fn object(stream: Stream, moment: &Moment) -> MapObject {
     }
 }
 
-/// Whether a surface that matters moved between two grids of the same blocks.
-fn changed(before: &SparseGrid, after: &SparseGrid) -> bool {
-    let blocks = before.blocks_of_values().zip(after.blocks_of_values());
-    let sides = |(a, b): &(&f32, &f32)| (**a > HALF) != (**b > HALF);
-    blocks.into_iter().any(|(a, b)| a.iter().zip(b).filter(sides).count() > CHANGED_CORNERS)
+/// The reduction for some frames: one time may take as many rays as an eighth of the persistent surface.
+fn stride(cx: &Context, frames: &[&Frame]) -> u32 {
+    views::stride(frames, cx.config.depth_rays / 8)
 }
 
-fn dynamic_geometry(
+/// The frames nearest in time, in order of time.
+fn nearest<'a>(cx: &Context<'a>, frame: &Frame) -> Vec<&'a Frame> {
+    let mut frames: Vec<&Frame> = cx.scene.frames.iter().collect();
+    frames.sort_by(|a, b| (a.time - frame.time).abs().total_cmp(&(b.time - frame.time).abs()));
+    frames.truncate(cx.config.dynamic_views.max(1));
+    frames.sort_by(|a, b| a.time.total_cmp(&b.time));
+    frames
+}
+
+/// The surface that some frames' cameras see of a stream at a moment.
+fn fused(
     cx: &Context,
-    query: &Query,
-    grid: &SparseGrid,
+    stream: Stream,
+    moment: &Moment,
+    frames: &[&Frame],
     name: &str,
     views: &[ViewFrame],
 ) -> Result<Geometry, MapError> {
-    let mut mesh = march(grid, HALF).map_err(MapError::extract(name))?;
-    smooth(&mut mesh, cx.config.smoothing, 0.5 * cx.voxel as f32);
-    let length = cx.opaque_length();
-    let value = |p: &[Vec3A], out: &mut [f32]| opacity(query, p, out, length, |p| cx.to_unit(p));
-    let normals = gradient_normals(&mesh, &value, cx.voxel as f32);
-    let surface = Surface::seen_from(cx, name, mesh, normals, views)?;
-    let colours = |s: &Surface| field_colours(query, s, |p| cx.to_unit(p));
-    Ok(surface.into_geometry(cx, name.to_owned(), Stream::Dynamic, colours))
-}
-
-fn actor_geometry(cx: &Context, moment: &Moment, name: &str) -> Result<Geometry, MapError> {
-    let frame = moment.frame;
-    let Some(query) = Query::new(&cx.model, Stream::Actor, frame.time as f32) else {
-        return Ok(Geometry::default());
-    };
-    let (camera, c2w) = refined_camera(cx.model.field, frame);
-    let frustum = Frustum::new(cx, camera, c2w);
-    let (grid, threshold) = (&cx.model.grids.streams[2], cx.model.grids.threshold[2]);
-    let may_hold = |center: Vec3A, half: f32| {
-        let Some((low, high)) = frustum.bounds(cx, center, half) else { return false };
-        grid.any_at_least(low, high, threshold)
-    };
-    let length = cx.opaque_length();
-    // Outside the image the actor's coordinates mean nothing.
-    let value = |points: &[Vec3A], out: &mut [f32]| {
-        opacity(&query, points, out, length, |p| frustum.to_stream(cx, p).unwrap_or(Vec3::ZERO));
-        for (p, v) in points.iter().zip(out) {
-            if frustum.to_stream(cx, *p).is_none() {
-                *v = 0.0;
+    let time = moment.frame.time as f32;
+    let (stride, spread) = (stride(cx, frames), cx.config.truncation_voxels * cx.voxel);
+    let shown = |frame: &&Frame| {
+        let mut map = stream_depth(&cx.model, stream, frame, time, &cx.sampling, stride, spread);
+        for (depth, shares) in map.depth.iter_mut().zip(&map.shares) {
+            if shares[stream as usize] <= SHOWN {
+                *depth = 0.0;
             }
         }
+        map
     };
-    let extract = |e| MapError::extract(name)(e);
-    let mut mesh = march(&SparseGrid::sample(&frustum.spec, &may_hold, &value).map_err(extract)?, HALF)
-        .map_err(extract)?;
+    let maps: Vec<DepthMap> = frames.iter().map(shown).collect();
+    let depths: Vec<DepthFrame> = maps.iter().map(views::depth_frame).collect();
+    let options = TsdfOptions { truncation: spread, min_weight: 0.0, max_depth: f32::INFINITY };
+    let volume = TsdfVolume::fuse(&cx.spec, &depths, &options);
+    let mut mesh = volume.and_then(|v| v.mesh()).map_err(MapError::extract(name))?;
     smooth(&mut mesh, cx.config.smoothing, 0.5 * cx.voxel as f32);
-    let normals = gradient_normals(&mesh, &value, cx.voxel as f32);
-    let normals = normals.iter().map(|n| frustum.turn(*n)).collect();
-    for p in &mut mesh.positions {
-        *p = frustum.to_grid(cx, *p);
-    }
-    let stride = views::stride(&[frame], cx.config.depth_rays / cx.scene.frames.len().max(1));
-    let seen = views::look(cx, frame, stride)?;
-    let surface = Surface::seen_from(cx, name, mesh, normals, &[seen.moving_view()])?;
-    let colours = |s: &Surface| field_colours(&query, s, |p| frustum.from_grid(cx, p));
-    Ok(surface.into_geometry(cx, name.to_owned(), Stream::Actor, colours))
+    let normals = vertex_normals(&mesh);
+    let surface = Surface::seen_from(cx, name, mesh, normals, views)?;
+    let Some(query) = Query::new(&cx.model, stream, time) else { return Ok(Geometry::default()) };
+    let (camera, c2w) = refined_camera(cx.model.field, moment.frame);
+    let to_stream = |p: Vec3A| match stream {
+        Stream::Actor => actor_point(cx, &camera, &c2w, p),
+        _ => cx.to_unit(p),
+    };
+    let colours = |s: &Surface| field_colours(&query, s, to_stream);
+    Ok(surface.into_geometry(cx, name.to_owned(), stream, colours))
 }
 
-/// A grid in one camera's axes over what the actor can reach.
-struct Frustum {
-    camera: Camera,
-    c2w: Pose,
-    /// Origin: the box's smallest corner in camera coordinates.
-    spec: GridSpec,
-    /// World units per unit.
-    scale: f32,
-    near: f32,
+/// Actor coordinates of a position relative to the grid's origin; the nearest in the image for those outside.
+fn actor_point(cx: &Context, camera: &Camera, c2w: &Pose, p: Vec3A) -> Vec3 {
+    let world = glam::DVec3::from_array(cx.spec.origin) + p.as_dvec3();
+    let at = c2w.inverse().transform_point3(world);
+    let size = DVec2::new(f64::from(camera.width), f64::from(camera.height));
+    let uv = camera.project(at).map_or(Vec2::splat(0.5), |uv| (uv / size).as_vec2());
+    let z = (at.z / cx.model.field.normalisation.scale) as f32;
+    cx.model.actor_point(uv.clamp(Vec2::ZERO, Vec2::ONE), z)
 }
 
-impl Frustum {
-    fn new(cx: &Context, camera: Camera, c2w: Pose) -> Self {
-        let field = cx.model.field;
-        let scale = field.normalisation.scale;
-        let (near, far) = (f64::from(field.near) * scale, f64::from(field.actor_far) * scale);
-        let (w, h) = (f64::from(camera.width), f64::from(camera.height));
-        let (mut min, mut max) = (DVec3::new(0.0, 0.0, near), DVec3::new(0.0, 0.0, far));
-        for (x, y) in
-            [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5)]
-        {
-            let p = camera.unproject(glam::DVec2::new(x * w, y * h)) * far;
-            min = min.min(p);
-            max = max.max(p);
-        }
-        let spec = GridSpec::covering(min.to_array(), max.to_array(), cx.voxel);
-        Self { camera, c2w, spec, scale: scale as f32, near: near as f32 }
-    }
+/// Centres (units) of the cells in which there is dynamic density at some time.
+fn occupied_cells(cx: &Context) -> Vec<Vec3> {
+    let (grid, threshold) = (&cx.model.grids.streams[1], cx.model.grids.threshold[1]);
+    let cells = grid.dims().as_usizevec3().element_product();
+    let center = |n: usize| grid.point(n, Vec3::splat(0.5), 0.5).0;
+    let at_some_time = |n: &usize| grid.sigma.iter().skip(*n).step_by(cells).any(|&sigma| sigma >= threshold);
+    (0..cells).filter(at_some_time).map(center).collect()
+}
 
-    /// Camera coordinates (world units) of a position relative to this grid's origin.
-    fn to_camera(&self, p: Vec3A) -> DVec3 {
-        DVec3::from_array(self.spec.origin) + p.as_dvec3()
-    }
-
-    /// Image fraction and actor coordinates; `None` outside the image.
-    fn to_stream(&self, cx: &Context, p: Vec3A) -> Option<Vec3> {
-        self.actor(cx, self.to_camera(p))
-    }
-
-    fn actor(&self, cx: &Context, at: DVec3) -> Option<Vec3> {
-        let uv = self.camera.project(at)?;
-        let uv = Vec2::new(uv.x as f32 / self.camera.width as f32, uv.y as f32 / self.camera.height as f32);
-        let inside = uv.cmpge(Vec2::ZERO).all() && uv.cmple(Vec2::ONE).all();
-        inside.then(|| cx.model.actor_point(uv, at.z as f32 / self.scale))
-    }
-
-    /// Bounds of a cube in actor coordinates; `None` if it is behind the camera.
-    fn bounds(&self, cx: &Context, center: Vec3A, half: f32) -> Option<(Vec3, Vec3)> {
-        let center = self.to_camera(center);
-        let half = f64::from(half);
-        if center.z + half <= f64::from(self.near) {
-            return None;
-        }
-        let (mut low, mut high) = (Vec3::ONE, Vec3::ZERO);
-        for i in 0..8 {
-            let sign = |bit: i32| if i >> bit & 1 == 0 { -half } else { half };
-            let mut corner = center + DVec3::new(sign(0), sign(1), sign(2));
-            corner.z = corner.z.max(f64::from(self.near));
-            // Without the lens: its bend is small against a cell of the actor's grid, and outside the image the
-            // polynomial may fold back.
-            let uv = Vec2::new(
-                ((corner.x / corner.z * self.camera.fx + self.camera.cx) / f64::from(self.camera.width))
-                    as f32,
-                ((corner.y / corner.z * self.camera.fy + self.camera.cy) / f64::from(self.camera.height))
-                    as f32,
-            );
-            let p = cx.model.actor_point(uv, corner.z as f32 / self.scale);
-            low = low.min(p);
-            high = high.max(p);
-        }
-        let visible = low.x <= 1.0 && low.y <= 1.0 && high.x >= 0.0 && high.y >= 0.0;
-        visible.then(|| (low.clamp(Vec3::ZERO, Vec3::ONE), high.clamp(Vec3::ZERO, Vec3::ONE)))
-    }
-
-    fn turn(&self, normal: [f32; 3]) -> [f32; 3] {
-        (self.c2w.matrix3.as_mat3() * Vec3::from_array(normal)).normalize_or(Vec3::Z).to_array()
-    }
-
-    /// From relative to this grid's origin to relative to the map's grid.
-    fn to_grid(&self, cx: &Context, p: [f32; 3]) -> [f32; 3] {
-        let world = self.c2w.transform_point3(self.to_camera(Vec3A::from_array(p)));
-        (world - DVec3::from_array(cx.spec.origin)).as_vec3().to_array()
-    }
-
-    /// Actor coordinates of a position relative to the map's grid.
-    fn from_grid(&self, cx: &Context, p: Vec3A) -> Vec3 {
-        let world = DVec3::from_array(cx.spec.origin) + p.as_dvec3();
-        self.actor(cx, self.c2w.inverse().transform_point3(world)).unwrap_or(Vec3::splat(0.5))
-    }
+/// Opacities of these cells at a moment.
+fn opacities(cx: &Context, moment: &Moment, cells: &[Vec3]) -> Vec<f32> {
+    let Some(query) = Query::new(&cx.model, Stream::Dynamic, moment.frame.time as f32) else {
+        return Vec::new();
+    };
+    let length = cx.model.grids.streams[1].cell().max_element();
+    let mut out = vec![0.0; cells.len()];
+    out.par_chunks_mut(1024).zip(cells.par_chunks(1024)).for_each(|(out, cells)| {
+        query.density(cells, out);
+        out.iter_mut().for_each(|v| *v = one_minus_exp_neg(*v * length));
+    });
+    out
 }

@@ -7,7 +7,7 @@ use super::build::{Builder, Context, Stage};
 use super::config::SurfaceMethod;
 use super::error::MapError;
 use super::surface::{Surface, field_colours, gradient_normals};
-use super::views::SeenFrame;
+use super::views::{SeenFrame, depth_frame};
 use crate::extract::clean::{smooth, vertex_normals};
 use crate::extract::tsdf::{DepthFrame, TsdfOptions, TsdfVolume};
 use crate::extract::visibility::ViewFrame;
@@ -61,7 +61,7 @@ fn fused(cx: &Context, seen: &[SeenFrame]) -> Result<TriMesh, MapError> {
         min_weight: cx.config.min_views,
         max_depth: f32::INFINITY,
     };
-    let frames: Vec<DepthFrame> = seen.iter().map(SeenFrame::depth_frame).collect();
+    let frames: Vec<DepthFrame> = seen.iter().map(|s| depth_frame(&s.map)).collect();
     let volume = TsdfVolume::fuse(&cx.spec, &frames, &options);
     volume.and_then(|v| v.mesh()).map_err(MapError::extract("persistent"))
 }

@@ -4,7 +4,8 @@ use super::build::{Builder, Context, Stage};
 use super::error::MapError;
 use crate::extract::tsdf::DepthFrame;
 use crate::extract::visibility::ViewFrame;
-use crate::render::depth::{DepthMap, persistent_depth};
+use crate::field::Stream;
+use crate::render::depth::{DepthMap, stream_depth};
 use crate::scene::{Camera, Frame, Split};
 
 /// More than this share of a pixel's light taken away in front of the persistent surface hides it.
@@ -20,12 +21,6 @@ pub(super) struct SeenFrame {
 }
 
 impl SeenFrame {
-    /// For the fusion: depth with its confidence.
-    pub(super) fn depth_frame(&self) -> DepthFrame<'_> {
-        let DepthMap { camera, c2w, depth, confidence, .. } = &self.map;
-        DepthFrame { camera: *camera, c2w: *c2w, depth, confidence: Some(confidence), rgb: None }
-    }
-
     /// For the persistent surface's visibility and colours.
     pub(super) fn persistent_view(&self) -> ViewFrame<'_> {
         ViewFrame {
@@ -40,6 +35,12 @@ impl SeenFrame {
     pub(super) fn moving_view(&self) -> ViewFrame<'_> {
         ViewFrame { camera: self.map.camera, c2w: self.map.c2w, depth: &self.map.depth, rgb: None }
     }
+}
+
+/// For the fusion: depth with its confidence.
+pub(super) fn depth_frame(map: &DepthMap) -> DepthFrame<'_> {
+    let DepthMap { camera, c2w, depth, confidence, .. } = map;
+    DepthFrame { camera: *camera, c2w: *c2w, depth, confidence: Some(confidence), rgb: None }
 }
 
 /// Looks from all training frames, at a resolution that keeps to the number of rays allowed.
@@ -58,9 +59,11 @@ pub(super) fn look_from_all(b: &mut Builder) -> Result<Vec<SeenFrame>, MapError>
 /// Looks from one frame.
 pub(super) fn look(cx: &Context, frame: &Frame, stride: u32) -> Result<SeenFrame, MapError> {
     let spread = cx.config.truncation_voxels * cx.voxel;
-    let mut map = persistent_depth(&cx.model, frame, &cx.sampling, stride, spread);
+    let mut map =
+        stream_depth(&cx.model, Stream::Persistent, frame, frame.time as f32, &cx.sampling, stride, spread);
     let rgb = shrink(&frame.load_rgb()?.pixels, &frame.camera, stride);
-    for (c, o) in map.confidence.iter_mut().zip(&map.obstruction) {
+    let mut obstruction: Vec<f32> = map.shares.iter().map(|s| (s[1] + s[2]).min(1.0)).collect();
+    for (c, o) in map.confidence.iter_mut().zip(&obstruction) {
         // What was hidden in this frame was not trained on in it; other frames know better.
         *c *= 1.0 - o;
     }
@@ -68,11 +71,11 @@ pub(super) fn look(cx: &Context, frame: &Frame, stride: u32) -> Result<SeenFrame
         let usable = shrink_mask(&mask, &frame.camera, stride);
         for (n, _) in usable.iter().enumerate().filter(|(_, usable)| !**usable) {
             map.confidence[n] = 0.0;
-            map.obstruction[n] = 1.0;
+            obstruction[n] = 1.0;
         }
     }
     let free = |(d, o): (&f32, &f32)| if *o < HIDDEN { *d } else { 0.0 };
-    let free_depth = map.depth.iter().zip(&map.obstruction).map(free).collect();
+    let free_depth = map.depth.iter().zip(&obstruction).map(free).collect();
     Ok(SeenFrame { map, free_depth, rgb })
 }
 

@@ -1,4 +1,4 @@
-//! Depth of the persistent surface alone, through whatever moves in front of it, and how sure of it a ray is.
+//! Depth of one stream alone, through whatever is in front of it, and how sure of it a ray is.
 
 use glam::Vec2;
 use pulp::{Simd, WithSimd};
@@ -9,12 +9,13 @@ use super::forward::{Chunk, Model, RayInput};
 use super::rays::{View, pixel_directions};
 use super::refined::{reduced, refined_camera};
 use super::sampler::Sampling;
+use crate::field::Stream;
 use crate::scene::{Camera, Frame, Pose};
 
 /// Rays traced together.
 const CHUNK_RAYS: usize = 32;
 
-/// The persistent surface as one frame sees it; layers are `[height * width]` of `camera`.
+/// One stream's surface as one frame sees it; layers are `[height * width]` of `camera`.
 #[derive(Clone, Debug)]
 pub struct DepthMap {
     /// Refined intrinsics at this map's resolution.
@@ -26,14 +27,17 @@ pub struct DepthMap {
     /// Share of the ray's light that ends within `spread` of that depth, 0–1: small in fog, across discontinuities
     /// and where nothing is.
     pub confidence: Vec<f32>,
-    /// Share of the light that moving things (dynamic, actor) take away in front of it, 0–1.
-    pub obstruction: Vec<f32>,
+    /// Share of the light that each stream takes when all are there, 0–1.
+    pub shares: Vec<[f32; 3]>,
 }
 
-/// Traces the frame's rays, one per square of `stride` pixels. `spread` is in world units.
-pub fn persistent_depth(
+/// Traces the frame's rays, one per square of `stride` pixels, as things are at `time`, and finds where `stream` alone
+/// stops half of what it stops of the light. `spread` is in world units.
+pub fn stream_depth(
     model: &Model,
+    stream: Stream,
     frame: &Frame,
+    time: f32,
     sampling: &Sampling,
     stride: u32,
     spread: f64,
@@ -51,12 +55,12 @@ pub fn persistent_depth(
             RayInput { view: 0, dir_cam, uv: (at + 0.5) * stride as f32 / size, jitter: 0.5 }
         })
         .collect();
-    let views = [View::new(field, frame)];
+    let views = [View::new(field, frame).at_time(field, time)];
     let spread = (spread / field.normalisation.scale) as f32;
     let arch = pulp::Arch::new();
     let rows: Vec<Vec<Traced>> = inputs
         .par_chunks(CHUNK_RAYS * 16)
-        .map(|inputs| arch.dispatch(DepthPass { model, views: &views, inputs, sampling, spread }))
+        .map(|inputs| arch.dispatch(DepthPass { model, stream, views: &views, inputs, sampling, spread }))
         .collect();
     let rays = rows.concat();
     let to_world = |t: f32| (f64::from(t) * field.normalisation.scale) as f32;
@@ -65,7 +69,7 @@ pub fn persistent_depth(
         c2w,
         depth: rays.iter().zip(&inputs).map(|(r, i)| to_world(r.median * i.dir_cam.z)).collect(),
         confidence: rays.iter().map(|r| r.confidence).collect(),
-        obstruction: rays.iter().map(|r| r.obstruction).collect(),
+        shares: rays.iter().map(|r| r.shares).collect(),
     }
 }
 
@@ -73,11 +77,12 @@ pub fn persistent_depth(
 struct Traced {
     median: f32,
     confidence: f32,
-    obstruction: f32,
+    shares: [f32; 3],
 }
 
 struct DepthPass<'a> {
     model: &'a Model<'a>,
+    stream: Stream,
     views: &'a [View],
     inputs: &'a [RayInput],
     sampling: &'a Sampling,
@@ -89,7 +94,7 @@ impl WithSimd for DepthPass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Vec<Traced> {
-        let Self { model, views, inputs, sampling, spread } = self;
+        let Self { model, stream, views, inputs, sampling, spread } = self;
         let n = sampling.count;
         let mut chunk = Chunk::default();
         let mut alone = vec![Weighted::default(); n];
@@ -102,6 +107,7 @@ impl WithSimd for DepthPass<'_> {
                     &mut chunk.intervals[range.clone()],
                     &chunk.weighted[range],
                     &mut alone,
+                    stream as usize,
                     spread,
                 ));
             }
@@ -110,30 +116,40 @@ impl WithSimd for DepthPass<'_> {
     }
 }
 
-/// One ray: composites the persistent stream again as if it were alone.
+/// One ray: composites stream `s` again as if it were alone.
 #[inline(always)]
-fn trace(intervals: &mut [Interval], mixed: &[Weighted], alone: &mut [Weighted], spread: f32) -> Traced {
-    let obstruction: f32 = mixed.iter().map(|w| w.weight[1] + w.weight[2]).sum();
+fn trace(
+    intervals: &mut [Interval],
+    mixed: &[Weighted],
+    alone: &mut [Weighted],
+    s: usize,
+    spread: f32,
+) -> Traced {
+    let mut shares = [0.0; 3];
+    for w in mixed {
+        (0..3).for_each(|k| shares[k] += w.weight[k]);
+    }
     for i in intervals.iter_mut() {
-        i.sigma[1] = 0.0;
-        i.sigma[2] = 0.0;
+        let sigma = i.sigma[s];
+        i.sigma = [0.0; 3];
+        i.sigma[s] = sigma;
     }
     let left = composite::weights(intervals, alone);
-    let median = median(intervals, alone, 0.5 * (1.0 - left));
+    let median = median(intervals, alone, s, 0.5 * (1.0 - left));
     let confidence = intervals.iter().zip(alone.iter()).map(|(i, w)| {
         let (from, to) = (i.t - 0.5 * i.delta, i.t + 0.5 * i.delta);
         let inside = (to.min(median + spread) - from.max(median - spread)).max(0.0);
-        if i.delta > 0.0 { w.weight[0] * (inside / i.delta).min(1.0) } else { 0.0 }
+        if i.delta > 0.0 { w.weight[s] * (inside / i.delta).min(1.0) } else { 0.0 }
     });
-    Traced { median, confidence: confidence.sum(), obstruction: obstruction.min(1.0) }
+    Traced { median, confidence: confidence.sum(), shares }
 }
 
 /// Distance at which the weights first add up to `half`, linear inside the interval; 0 if there is no weight.
 #[inline(always)]
-fn median(intervals: &[Interval], weighted: &[Weighted], half: f32) -> f32 {
+fn median(intervals: &[Interval], weighted: &[Weighted], s: usize, half: f32) -> f32 {
     let mut sum = 0.0;
     for (i, w) in intervals.iter().zip(weighted) {
-        let w = w.weight[0];
+        let w = w.weight[s];
         if w > 0.0 && sum + w >= half {
             return i.t + i.delta * ((half - sum) / w - 0.5);
         }
@@ -154,7 +170,7 @@ mod tests {
         let mut mixed = vec![Weighted::default(); intervals.len()];
         composite::weights(&intervals, &mut mixed);
         let mut alone = mixed.clone();
-        trace(&mut intervals, &mixed, &mut alone, 0.1)
+        trace(&mut intervals, &mixed, &mut alone, 0, 0.1)
     }
 
     #[test]
@@ -164,7 +180,7 @@ mod tests {
                 |k| if k == 2 { [0.0, 0.0, 500.0] } else { [if k >= 7 { 500.0 } else { 0.0 }, 0.0, 0.0] },
             ));
         assert!((0.7..0.8).contains(&t.median), "{}", t.median);
-        assert!(t.confidence > 0.99 && t.obstruction > 0.99, "{} {}", t.confidence, t.obstruction);
+        assert!(t.confidence > 0.99 && t.shares[2] > 0.99, "{} {:?}", t.confidence, t.shares);
     }
 
     #[test]
@@ -172,6 +188,6 @@ mod tests {
         let fog = run(wall(|_| [2.0, 0.0, 0.0]));
         assert!(fog.confidence < 0.4, "{}", fog.confidence);
         let nothing = run(wall(|_| [0.0; 3]));
-        assert_eq!((nothing.median, nothing.confidence, nothing.obstruction), (0.0, 0.0, 0.0));
+        assert_eq!((nothing.median, nothing.confidence, nothing.shares), (0.0, 0.0, [0.0; 3]));
     }
 }

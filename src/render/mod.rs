@@ -9,4 +9,6 @@ pub mod query;
 pub mod rays;
 pub mod refined;
 pub mod sampler;
+#[cfg(test)]
+pub(crate) mod testing;
 pub mod views;

@@ -77,6 +77,12 @@ impl View {
         }
     }
 
+    /// The same camera with the scene as it is at another time.
+    pub fn at_time(self, field: &Field, time: f32) -> Self {
+        let code_knots = field.codes.each_ref().map(|c| c.as_ref().map(|c| c.locate(time)));
+        Self { code_knots, time, ..self }
+    }
+
     /// The ray through a pixel whose direction in camera axes is `dir_cam`.
     pub fn ray(&self, dir_cam: Vec3, extent: Vec3, near: f32) -> Ray {
         let [rx, ry, rz, tx, ty, tz] = self.refinement;

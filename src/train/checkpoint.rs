@@ -68,6 +68,30 @@ impl Trained {
         run.join("checkpoint").join("field.safetensors")
     }
 
+    /// Drops the streams that the scene does not need, and everything that was learned for them.
+    pub fn keep_streams(&mut self, streams: [bool; 3]) {
+        let old = &self.field;
+        let mut field = Field::zeros(FieldShape { streams, ..old.shape.clone() });
+        let mut copy = |to: std::ops::Range<usize>, from: std::ops::Range<usize>| {
+            if !to.is_empty() {
+                field.weights[to].copy_from_slice(&old.weights[from]);
+            }
+        };
+        for (to, from) in field.layout.streams.iter().zip(&old.layout.streams) {
+            copy(to.trunk.clone(), from.trunk.clone());
+            copy(to.head.clone(), from.head.clone());
+            copy(to.code.clone(), from.code.clone());
+        }
+        let (to, from) = (&field.layout, &old.layout);
+        copy(to.exposure.clone(), from.exposure.clone());
+        copy(to.pose.clone(), from.pose.clone());
+        copy(to.rig.clone(), from.rig.clone());
+        for s in Stream::ALL.into_iter().filter(|s| streams[*s as usize]) {
+            field.tables[s as usize].clone_from(&old.tables[s as usize]);
+        }
+        self.field = field;
+    }
+
     /// Writes the field and, where given, what is needed to resume its training.
     ///
     /// # Errors

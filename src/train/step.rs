@@ -155,6 +155,16 @@ impl Optimiser {
         }
     }
 
+    /// Follows [`super::Trained::keep_streams`]: moments of dropped streams go, those of the dense weights start anew
+    /// (their vector has changed its layout, and they forget within some hundred steps).
+    pub fn keep_streams(&mut self, field: &Field) {
+        for (states, tables) in self.tables.iter_mut().zip(&field.tables) {
+            states.truncate(tables.len());
+        }
+        self.dense = Moments::new(field.layout.len);
+        self.gradient = vec![0.0; field.layout.len];
+    }
+
     /// Runs one step.
     pub fn step(
         &mut self,
