@@ -109,7 +109,8 @@ mod tests {
             let x = (i as f32 * 1e-4).powi(3);
             let truth = -(-f64::from(x)).exp_m1();
             let err = (f64::from(one_minus_exp_neg(x)) - truth).abs() / truth;
-            assert!(err < 5e-7, "1 - exp(-{x}) is off by {err:e}");
+            // The error of e^-x (2.5e-7) times e^-x / (1 - e^-x), which is 3.5 where the series ends.
+            assert!(err < 9e-7, "1 - exp(-{x}) is off by {err:e}");
         }
         assert_eq!(one_minus_exp_neg(0.0), 0.0);
     }

@@ -75,3 +75,49 @@ impl Trajectory {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn weights_are_a_partition_of_unity_everywhere() {
+        for t in
+            [Trajectory::even(1, 2), Trajectory::even(7, 2), Trajectory::at(vec![0.9, 0.1, 0.15, 0.1], 2)]
+        {
+            for n in -10..110 {
+                let at = t.locate(n as f32 / 100.0);
+                assert!((at.a.1 + at.b.1 - 1.0).abs() < 1e-6 && at.a.1 >= 0.0 && at.b.1 >= 0.0, "{at:?}");
+                assert!(at.a.0.max(at.b.0) < t.knots.len());
+            }
+        }
+    }
+
+    #[test]
+    fn codes_are_linear_between_knots_and_constant_outside() {
+        let t = Trajectory::at(vec![0.6, 0.2], 1);
+        let z = |time: f32| {
+            let mut out = [0.0];
+            t.evaluate(&[10.0, 20.0], t.locate(time), &mut out);
+            out[0]
+        };
+        assert_eq!([z(-1.0), z(0.2), z(0.6), z(5.0), z(f32::NEG_INFINITY)], [10.0, 10.0, 20.0, 20.0, 10.0]);
+        assert!((z(0.3) - 12.5).abs() < 1e-5);
+    }
+
+    #[test]
+    fn backward_is_the_transpose_of_evaluate() {
+        let t = Trajectory::even(5, 3);
+        let gamma: Vec<f32> = (0..15).map(|n| (n as f32).sin()).collect();
+        for time in [0.0, 0.1, 0.5, 0.77, 1.0] {
+            let at = t.locate(time);
+            let g = [1.0, -0.5, 2.0];
+            let mut z = [0.0; 3];
+            t.evaluate(&gamma, at, &mut z);
+            let mut scattered = vec![0.0; 15];
+            t.backward(at, &g, &mut scattered);
+            let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
+            assert!((dot(&z, &g) - dot(&gamma, &scattered)).abs() < 1e-5);
+        }
+    }
+}

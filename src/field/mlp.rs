@@ -27,6 +27,11 @@ impl Mlp {
         Self { widths: widths.iter().map(|w| w.next_multiple_of(BLOCK)).collect() }
     }
 
+    /// Widths of input, hidden layers and output, as rounded up.
+    pub fn widths(&self) -> &[usize] {
+        &self.widths
+    }
+
     /// Width of the input, as rounded up.
     pub fn input(&self) -> usize {
         self.widths[0]

@@ -6,7 +6,11 @@
 pub mod codes;
 pub mod config;
 pub mod hashgrid;
+#[cfg(test)]
+mod hashgrid_tests;
 pub mod mlp;
+#[cfg(test)]
+mod mlp_tests;
 pub mod stream;
 
 use std::ops::Range;
@@ -103,6 +107,15 @@ pub struct FieldShape {
     pub background: [f32; 3],
 }
 
+impl FieldShape {
+    /// The lattices of a stream: over the box, or over the camera's frustum for the actor.
+    pub fn grid(&self, stream: Stream) -> HashGrid {
+        let c = self.config.stream(stream);
+        let extent = if stream == Stream::Actor { Vec3::ONE } else { self.normalisation.extent };
+        HashGrid::new(extent, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows)
+    }
+}
+
 /// The field: three streams, frame codes, exposure and pose refinement.
 #[derive(Clone, Debug)]
 pub struct Field {
@@ -143,22 +156,7 @@ impl Field {
         let times = &shape.times;
         let net = |stream: Stream| {
             let c = config.stream(stream);
-            let grid = match stream {
-                Stream::Actor => HashGrid::new(
-                    Vec3::ONE,
-                    c.levels,
-                    Vec3::splat(c.coarsest),
-                    Vec3::splat(c.finest),
-                    c.log2_rows,
-                ),
-                _ => HashGrid::new(
-                    extent,
-                    c.levels,
-                    Vec3::splat(c.coarsest),
-                    Vec3::splat(c.finest),
-                    c.log2_rows,
-                ),
-            };
+            let grid = shape.grid(stream);
             let view = if stream == Stream::Persistent { VIEW } else { 0 };
             StreamNet::new(grid, c.hidden, c.layers, c.code, view, c.density_bias)
         };

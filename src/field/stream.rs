@@ -22,7 +22,7 @@ const RAW_SIGMA_LIMIT: f32 = 15.0;
 ///
 /// NeuralDiff's softplus has no bound, so that a trace of density with an enormous β can excuse any error; bounded, a
 /// stream must really stand in front of a pixel to excuse it.
-const BETA_MAX: f32 = 0.1;
+pub(crate) const BETA_MAX: f32 = 0.1;
 
 /// Shape of one stream's network.
 #[derive(Clone, Debug, PartialEq)]

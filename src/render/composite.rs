@@ -35,6 +35,12 @@ impl Weighted {
     pub fn total(&self) -> f32 {
         self.weight[0] + self.weight[1] + self.weight[2]
     }
+
+    /// 1 − α = e^(−δΣ): the share of the arriving light that goes on.
+    #[inline(always)]
+    pub fn pass(&self) -> f32 {
+        self.pass
+    }
 }
 
 /// Weights of all intervals of a ray, front to back; returns the light that is left behind the last.
@@ -82,7 +88,8 @@ pub fn backward(
             -0.5 + tau * (1.0 / 3.0 - tau * (0.125 - tau / 30.0))
         };
         let mixed = i.sigma[0] * g[0] + i.sigma[1] * g[1] + i.sigma[2] * g[2];
-        let shared = w.transmittance * i.delta * i.delta * mixed * d_phi - i.delta * behind;
+        // In this order no product leaves f32: δ Σ s g φ' is at most of the size of g where δΣ is large.
+        let shared = w.transmittance * i.delta * (i.delta * mixed * d_phi) - i.delta * behind;
         for s in 0..3 {
             d_sigma[k][s] = w.transmittance * i.delta * w.phi * g[s] + shared;
         }

@@ -9,9 +9,13 @@ use serde::{Deserialize, Serialize};
 
 use super::error::TrainError;
 use super::step::Optimiser;
+use crate::config::Config;
 use crate::field::hashgrid::Row;
 use crate::field::{Field, FieldShape, Stream};
 use crate::render::forward::Grids;
+
+#[cfg(test)]
+mod tests;
 
 /// A field with the density grids that make it fast to evaluate: what training gives, and all that the later
 /// stages need.
@@ -54,6 +58,37 @@ struct Header {
     grid_cells: f32,
     threshold: [f32; 3],
     progress: TrainingState,
+}
+
+impl Header {
+    /// Refuses a header that asks for a field which cannot be, or is larger than a file of `bytes`.
+    ///
+    /// # Errors
+    /// [`TrainError::Config`] or [`TrainError::Checkpoint`].
+    fn check(&self, path: &Path, bytes: usize) -> Result<(), TrainError> {
+        let mut config = Config { field: self.shape.config.clone(), ..Config::default() };
+        config.train.grid_cells = self.grid_cells;
+        config.validate()?;
+        let shape = &self.shape;
+        let extent = shape.normalisation.extent;
+        let sound = extent.min_element() > 0.0
+            && extent.max_element() <= 1.0
+            && !shape.times.is_empty()
+            && shape.times.iter().all(|t| t.is_finite());
+        if !sound {
+            return Err(damaged(path, "its box or its times are not those of a scene"));
+        }
+        let rows: usize = Stream::ALL
+            .into_iter()
+            .filter(|s| shape.streams[*s as usize])
+            .flat_map(|s| shape.grid(s).levels)
+            .map(|level| level.rows)
+            .sum();
+        match rows.saturating_mul(size_of::<Row>()) <= bytes {
+            true => Ok(()),
+            false => Err(damaged(path, "it is shorter than the tables of its header")),
+        }
+    }
 }
 
 /// Version of the layout of checkpoint files.
@@ -155,6 +190,7 @@ impl Trained {
         if header.format != FORMAT {
             return Err(damaged(&path, &format!("its format is {} and not {FORMAT}", header.format)));
         }
+        header.check(&path, bytes.len())?;
         let field = Field::zeros(header.shape);
         let mut grids = Grids::new(&field, header.grid_cells);
         grids.threshold = header.threshold;

@@ -18,11 +18,9 @@ pub struct LossConfig {
     pub transient_opacity: [f32; 2],
     /// Distortion (Barron et al. 2022, mip-NeRF 360, eq. 15): pulls a ray's weight together.
     pub distortion: f32,
-    /// Entropy of a ray's opacity per interval: surfaces are hard, air is empty.
+    /// Softness Σ_k T_k α_k (1 − α_k) of a ray: surfaces are hard, air is empty.
     pub entropy: f32,
-    /// Curvature of inverse depth across a patch of pixels: what has no texture is taken to be flat.
-    pub smoothness: f32,
-    /// Price of per-frame exposure away from none.
+    /// Price of per-frame exposure away from none: times half the squares of its six numbers.
     pub exposure: f32,
 }
 
@@ -34,7 +32,6 @@ impl Default for LossConfig {
             transient_opacity: [8.0, 6.0],
             distortion: 0.3,
             entropy: 0.0,
-            smoothness: 0.5,
             exposure: 0.1,
         }
     }
@@ -60,8 +57,6 @@ pub struct ChunkGradient {
     pub samples: [StreamSamples; 3],
     /// With respect to the six exposure numbers of each ray.
     pub exposure: Vec<[f32; 6]>,
-    /// With respect to each ray's inverse depth.
-    inverse_depth: Vec<f32>,
 }
 
 /// The colour that a ray should have, and how it was exposed.
@@ -75,25 +70,15 @@ pub struct RayTarget {
     pub exposure: [f32; 6],
 }
 
-/// How a chunk's rays and samples are arranged.
-#[derive(Clone, Copy, Debug)]
-pub struct ChunkShape {
-    /// Samples per ray.
-    pub samples: usize,
-    /// Rays come in squares of `patch`² neighbours, row by row.
-    pub patch: usize,
-}
-
 /// Evaluates the loss of a traced chunk and fills `grad`. `scale` multiplies the whole gradient (1 / rays).
 pub fn backward(
     config: &LossConfig,
     chunk: &Chunk,
     targets: &[RayTarget],
-    shape: ChunkShape,
+    count: usize,
     scale: f32,
     grad: &mut ChunkGradient,
 ) -> ChunkLoss {
-    let count = shape.samples;
     let total = chunk.intervals.len();
     grad.weight.resize(total, [0.0; 3]);
     grad.sigma.resize(total, [0.0; 3]);
@@ -102,7 +87,6 @@ pub fn backward(
         s.reset(total);
     }
     let mut loss = ChunkLoss::default();
-    smoothness(config, chunk, targets, shape, scale, &mut grad.inverse_depth);
     for (r, target) in targets.iter().enumerate() {
         let ray = &chunk.rays[r];
         let range = r * count..(r + 1) * count;
@@ -126,6 +110,8 @@ pub fn backward(
         loss.total += f64::from(0.5 * squared * precision + beta.ln());
         let d_beta = scale * (1.0 / beta - squared * precision / beta);
         let d_left = (0..3).map(|c| d_rgb[c] * target.background[c]).sum::<f32>();
+        let exposure = target.exposure.iter().map(|e| e * e).sum::<f32>();
+        let mut extra = 0.5 * config.exposure * exposure;
         for k in range.clone() {
             for s in 0..3 {
                 let w = chunk.weighted[k].weight[s];
@@ -136,27 +122,32 @@ pub fn backward(
                     grad.samples[s].rgb[k][c] = d_rgb[c] * w;
                 }
                 if s > 0 {
-                    g += scale * config.transient_opacity[s - 1];
+                    let price = config.transient_opacity[s - 1];
+                    extra += price * w;
+                    g += scale * price;
                     g += d_beta * chunk.samples[s].beta[k];
                     grad.samples[s].beta[k] = d_beta * w;
                 }
                 grad.weight[k][s] = g;
             }
         }
-        let d_inverse = grad.inverse_depth[r] / ray.ray.dir_cam.z;
-        if d_inverse != 0.0 {
-            for k in range.clone() {
-                let d = d_inverse / chunk.intervals[k].t;
-                grad.weight[k] = grad.weight[k].map(|g| g + d);
-            }
-        }
         if config.distortion > 0.0 {
-            distortion(
-                &chunk.intervals[range.clone()],
-                &chunk.weighted[range.clone()],
-                scale * config.distortion,
-                &mut grad.weight[range.clone()],
-            );
+            extra += config.distortion
+                * distortion(
+                    &chunk.intervals[range.clone()],
+                    &chunk.weighted[range.clone()],
+                    scale * config.distortion,
+                    &mut grad.weight[range.clone()],
+                );
+        }
+        if config.entropy > 0.0 {
+            // Σ_k T α (1 − α) = Σ_k w (1 − α), w the weight of all streams: here its gradient by w.
+            for (w, g) in chunk.weighted[range.clone()].iter().zip(&mut grad.weight[range.clone()]) {
+                extra += config.entropy * w.total() * w.pass();
+                for g in g {
+                    *g += scale * config.entropy * w.pass();
+                }
+            }
         }
         crate::render::composite::backward(
             &chunk.intervals[range.clone()],
@@ -169,86 +160,32 @@ pub fn backward(
         let d_transient = scale * config.transient;
         for k in range {
             let delta = chunk.intervals[k].delta;
+            let mut direct = 0.0;
             if config.entropy > 0.0 {
+                // And by 1 − α = e^(−δΣ).
                 let w = &chunk.weighted[k];
-                let alpha = (w.total() / w.transmittance.max(1e-6)).clamp(0.0, 1.0);
-                // d/dσ of α(1−α), weighted by the light that arrives: hard surfaces or nothing.
-                let d =
-                    scale * config.entropy * w.transmittance * (1.0 - 2.0 * alpha) * (1.0 - alpha) * delta;
-                grad.sigma[k][0] += d;
+                direct = -scale * config.entropy * w.total() * w.pass() * delta;
             }
             for s in 0..3 {
-                let extra = if s > 0 { d_transient * delta } else { 0.0 };
-                grad.samples[s].sigma[k] = grad.sigma[k][s] + extra;
+                let transient = if s > 0 { d_transient * delta } else { 0.0 };
+                grad.samples[s].sigma[k] = grad.sigma[k][s] + direct + transient;
             }
+            let [_, dynamic, actor] = chunk.intervals[k].sigma;
+            extra += config.transient * delta * (dynamic + actor);
         }
+        loss.total += f64::from(extra);
     }
     loss
 }
 
-/// Contrast between neighbours at which a depth edge costs 1/e of what it costs on a plain surface.
-const EDGE_CONTRAST: f32 = 0.1;
-
-/// Relative curvature below which the price is quadratic rather than linear.
-const FLAT: f32 = 0.01;
-
-/// Gradient, with respect to each ray's inverse z-depth, of the curvature of inverse depth across a patch.
-///
-/// Inverse depth is linear in the image on any plane, whatever its slant, so a plane costs nothing. The curvature is
-/// taken relative to the inverse depth itself, and weighted down where the image has an edge.
-fn smoothness(
-    config: &LossConfig,
-    chunk: &Chunk,
-    targets: &[RayTarget],
-    shape: ChunkShape,
-    scale: f32,
-    grad: &mut Vec<f32>,
-) {
-    grad.clear();
-    grad.resize(targets.len(), 0.0);
-    let side = shape.patch;
-    if config.smoothness == 0.0 || side < 3 {
-        return;
-    }
-    let inverse: Vec<f32> = (0..targets.len())
-        .map(|r| {
-            let range = r * shape.samples..(r + 1) * shape.samples;
-            let sum = |k: usize| chunk.weighted[k].total() / chunk.intervals[k].t.max(1e-6);
-            range.map(sum).sum::<f32>() / chunk.rays[r].ray.dir_cam.z
-        })
-        .collect();
-    let contrast = |a: usize, b: usize| -> f32 {
-        (0..3).map(|c| (targets[a].rgb[c] - targets[b].rgb[c]).abs()).sum::<f32>() / 3.0
-    };
-    for first in (0..targets.len()).step_by(side * side) {
-        for line in 0..side {
-            for at in 0..side - 2 {
-                for (start, step) in [(line * side + at, 1), (at * side + line, side)] {
-                    let a = first + start;
-                    let [a, b, c] = [a, a + step, a + 2 * step];
-                    let size = inverse[b].max(1e-3);
-                    let curvature = (inverse[a] - 2.0 * inverse[b] + inverse[c]) / size;
-                    let edge = (-(contrast(a, b) + contrast(b, c)) / EDGE_CONTRAST).exp();
-                    // Charbonnier: √(κ² + flat²); its derivative is bounded by 1.
-                    let slope = curvature / (curvature * curvature + FLAT * FLAT).sqrt();
-                    let d = scale * config.smoothness * edge * slope / size;
-                    grad[a] += d;
-                    grad[b] -= 2.0 * d;
-                    grad[c] += d;
-                }
-            }
-        }
-    }
-}
-
-/// Adds the gradient of Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i with respect to the weights, in O(n).
-fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &mut [[f32; 3]]) {
+/// Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i; adds its gradient with respect to the weights times `scale`, in O(n).
+fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &mut [[f32; 3]]) -> f32 {
     let (mut all, mut all_t) = (0.0, 0.0);
     for (i, w) in intervals.iter().zip(weighted) {
         all += w.total();
         all_t += w.total() * i.t;
     }
-    let (mut before, mut before_t) = (0.0, 0.0);
+    let (mut before, mut before_t, mut sum) = (0.0, 0.0, 0.0);
     for ((i, w), g) in intervals.iter().zip(weighted).zip(grad) {
         let (w, wt) = (w.total(), w.total() * i.t);
         let (after, after_t) = (all - before - w, all_t - before_t - wt);
@@ -256,7 +193,10 @@ fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &
         for g in g.iter_mut() {
             *g += scale * d;
         }
+        // A quadratic form is half the weights times its gradient.
+        sum += 0.5 * w * d;
         before += w;
         before_t += wt;
     }
+    sum
 }

@@ -8,6 +8,8 @@ pub mod loss;
 pub mod pixels;
 mod schedule;
 pub mod step;
+#[cfg(test)]
+mod testing;
 mod trainer;
 
 pub use self::checkpoint::Trained;

@@ -10,7 +10,7 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::adam::{self, Moments, StepSize, TableState};
-use super::loss::{self, ChunkGradient, ChunkLoss, ChunkShape, LossConfig, RayTarget};
+use super::loss::{self, ChunkGradient, ChunkLoss, LossConfig, RayTarget};
 use super::pixels::PixelSet;
 use crate::field::Field;
 use crate::field::hashgrid::{Level, Row};
@@ -20,6 +20,11 @@ use crate::render::rays::View;
 use crate::render::sampler::Sampling;
 use crate::rng::Rng;
 use crate::simd::TILE;
+
+#[cfg(test)]
+mod gradient_tests;
+#[cfg(test)]
+mod reference;
 
 /// Groups that a step is divided into; fixed, so that sums are taken in the same order on any machine.
 const GROUPS: usize = 16;
@@ -307,14 +312,13 @@ impl WithSimd for GroupPass<'_> {
             group.choose_rays(context, first_chunk + n);
             let Group { chunk, inputs, .. } = group;
             chunk.forward(simd, context.model, context.views, inputs, &context.plan.sampling);
-            let shape =
-                ChunkShape { samples: context.plan.sampling.count, patch: context.plan.patch as usize };
+            let count = context.plan.sampling.count;
             let scale = 1.0 / context.rays as f32;
             let l = loss::backward(
                 context.config,
                 &group.chunk,
                 &group.targets,
-                shape,
+                count,
                 scale,
                 &mut group.gradient,
             );

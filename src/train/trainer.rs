@@ -15,6 +15,9 @@ use crate::render::forward::{Grids, Model};
 use crate::render::image::render;
 use crate::scene::{Frame, Scene, Split};
 
+#[cfg(test)]
+mod tests;
+
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 50;
 

@@ -1,0 +1,177 @@
+//! The network kernels against plain f64 loops, and the vector widths against each other.
+
+use pulp::{Simd, WithSimd};
+
+use super::mlp::{Mlp, TileView};
+use crate::rng::Rng;
+use crate::simd::{AlignedVec, TILE};
+
+/// Tiles of a chunk.
+const TILES: usize = 3;
+
+/// Networks of odd widths, one to four layers.
+const SHAPES: [&[usize]; 4] = [&[1, 1], &[5, 7, 3], &[13, 6, 9, 4], &[33, 18, 1, 17, 2]];
+
+/// A network, inputs and output gradients, all random.
+struct Case {
+    net: Mlp,
+    params: Vec<f32>,
+    /// Activations with the inputs filled in.
+    tiles: AlignedVec,
+    /// Gradients with the outputs filled in.
+    grads: AlignedVec,
+}
+
+/// What the kernels make of a case.
+struct Outcome {
+    tiles: AlignedVec,
+    grads: AlignedVec,
+    params: Vec<f32>,
+}
+
+struct Pass<'a>(&'a Case);
+
+impl WithSimd for Pass<'_> {
+    type Output = Outcome;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Outcome {
+        let Case { net, params, tiles, grads } = self.0;
+        let (mut tiles, mut grads) = (tiles.clone(), grads.clone());
+        let packed = net.pack(params);
+        let stride = net.rows() * TILE;
+        for n in 0..TILES {
+            let tile = &mut tiles[n * stride..][..stride];
+            net.forward(simd, &packed, tile);
+            net.backward(simd, &packed, tile, &mut grads[n * stride..][..stride], true);
+        }
+        let mut sums = vec![0.0; net.parameters()];
+        let view = |data| TileView { data, stride, offset: 0 };
+        net.accumulate(simd, view(&tiles), view(&grads), TILES, &mut sums);
+        Outcome { tiles, grads, params: sums }
+    }
+}
+
+impl Case {
+    fn new(widths: &[usize], seed: u64) -> Self {
+        let net = Mlp::new(widths);
+        let mut rng = Rng::new(seed, 0, 0);
+        let mut number = move || 2.0 * rng.uniform() - 1.0;
+        let params = (0..net.parameters()).map(|_| number()).collect();
+        let (rows, input, output) = (net.rows(), net.input(), net.output_row());
+        let mut tiles = AlignedVec::zeros(TILES * rows * TILE);
+        let mut grads = AlignedVec::zeros(TILES * rows * TILE);
+        for n in 0..TILES {
+            tiles[n * rows * TILE..][..input * TILE].fill_with(&mut number);
+            grads[(n * rows + output) * TILE..(n + 1) * rows * TILE].fill_with(&mut number);
+        }
+        Self { net, params, tiles, grads }
+    }
+
+    /// Activations and gradients of one sample in f64; adds its parameter gradients to `sums`.
+    fn naive(&self, tile: usize, lane: usize, sums: &mut [f64]) -> (Vec<f64>, Vec<f64>) {
+        let widths = self.net.widths();
+        let rows = self.net.rows();
+        let at = |data: &[f32], row: usize| f64::from(data[(tile * rows + row) * TILE + lane]);
+        let mut values: Vec<Vec<f64>> = vec![(0..widths[0]).map(|i| at(&self.tiles, i)).collect()];
+        let mut starts = vec![0];
+        let w = |n: usize| f64::from(self.params[n]);
+        for (n, pair) in widths.windows(2).enumerate() {
+            let [n_in, n_out] = [pair[0], pair[1]];
+            let start = starts[n];
+            let x = &values[n];
+            let y = (0..n_out).map(|o| {
+                let sum: f64 = (0..n_in).map(|i| w(start + o * n_in + i) * x[i]).sum();
+                let y = sum + w(start + n_in * n_out + o);
+                if n + 2 < widths.len() { y.max(0.0) } else { y }
+            });
+            let y = y.collect();
+            values.push(y);
+            starts.push(start + n_in * n_out + n_out);
+        }
+        let mut grads = vec![(self.net.output_row()..rows).map(|o| at(&self.grads, o)).collect::<Vec<_>>()];
+        for n in (0..widths.len() - 1).rev() {
+            let [n_in, n_out] = [widths[n], widths[n + 1]];
+            let (x, dy) = (&values[n], &grads[0]);
+            for o in 0..n_out {
+                for i in 0..n_in {
+                    sums[starts[n] + o * n_in + i] += dy[o] * x[i];
+                }
+                sums[starts[n] + n_in * n_out + o] += dy[o];
+            }
+            let dx = (0..n_in).map(|i| {
+                let sum = (0..n_out).map(|o| w(starts[n] + o * n_in + i) * dy[o]).sum();
+                if n > 0 && x[i] <= 0.0 { 0.0 } else { sum }
+            });
+            let dx = dx.collect();
+            grads.insert(0, dx);
+        }
+        (values.concat(), grads.concat())
+    }
+}
+
+/// Products of up to 36 numbers below 1 summed over up to four layers: a hundred roundings of sums below 100.
+fn close(a: f32, b: f64, what: &str) {
+    assert!((f64::from(a) - b).abs() < 2e-5 * (1.0 + b.abs()), "{what}: {a} is not {b}");
+}
+
+#[test]
+fn networks_match_f64_loops_forward_and_backward() {
+    for (n, widths) in SHAPES.into_iter().enumerate() {
+        let case = Case::new(widths, n as u64);
+        let out = pulp::Arch::new().dispatch(Pass(&case));
+        let rows = case.net.rows();
+        let mut sums = vec![0.0; case.net.parameters()];
+        for tile in 0..TILES {
+            for lane in 0..TILE {
+                let (values, grads) = case.naive(tile, lane, &mut sums);
+                for row in 0..rows {
+                    let k = (tile * rows + row) * TILE + lane;
+                    close(out.tiles[k], values[row], "activation");
+                    close(out.grads[k], grads[row], "gradient");
+                }
+            }
+        }
+        for (a, b) in out.params.iter().zip(&sums) {
+            close(*a, *b, "parameter gradient");
+        }
+    }
+}
+
+/// Lanes are samples and every lane is computed with the same fused multiply-adds, so that the activations and their
+/// gradients are equal to the last bit; only sums over samples are taken in another order.
+#[test]
+fn all_fused_vector_widths_give_the_same_bits_per_sample() {
+    for (n, widths) in SHAPES.into_iter().enumerate() {
+        let case = Case::new(widths, n as u64);
+        let narrow = pulp::Scalar128b.vectorize(Pass(&case));
+        let wide = [pulp::Scalar256b.vectorize(Pass(&case)), pulp::Scalar512b.vectorize(Pass(&case))];
+        for out in &wide {
+            assert_eq!(bits(&out.tiles), bits(&narrow.tiles));
+            assert_eq!(bits(&out.grads), bits(&narrow.grads));
+            for (a, b) in out.params.iter().zip(&narrow.params) {
+                close(*a, f64::from(*b), "parameter gradient");
+            }
+        }
+    }
+}
+
+/// The host's instructions and the plain fallback, which does not fuse: equal up to rounding.
+#[test]
+fn the_scalar_fallback_matches_the_hosts_instructions() {
+    for (n, widths) in SHAPES.into_iter().enumerate() {
+        let case = Case::new(widths, n as u64);
+        let host = pulp::Arch::new().dispatch(Pass(&case));
+        let plain = pulp::Scalar.vectorize(Pass(&case));
+        for (a, b) in host.tiles.iter().zip(plain.tiles.iter()) {
+            close(*a, f64::from(*b), "activation");
+        }
+        for (a, b) in host.params.iter().zip(&plain.params) {
+            close(*a, f64::from(*b), "parameter gradient");
+        }
+    }
+}
+
+fn bits(v: &[f32]) -> Vec<u32> {
+    v.iter().map(|v| v.to_bits()).collect()
+}

@@ -1,0 +1,78 @@
+//! Where samples go.
+
+use glam::Vec3;
+
+use super::rays::Ray;
+use super::sampler::{Sampler, Sampling};
+use crate::rng::Rng;
+
+const SAMPLING: Sampling = Sampling { count: 24, step: 1.0 / 64.0, explore: 0.2, sharpness: 1.0 };
+
+fn ray(start: f32, end: f32) -> Ray {
+    Ray { origin: Vec3::ZERO, dir: Vec3::X, dir_cam: Vec3::Z, refined_cam: Vec3::Z, range: (start, end) }
+}
+
+fn edges(sampling: &Sampling, range: (f32, f32), jitter: f32, sigma: impl Fn(f32) -> f32) -> Vec<f32> {
+    let mut edges = vec![f32::NAN; sampling.count + 1];
+    assert!(Sampler::default().edges(&ray(range.0, range.1), sampling, jitter, |_, t| sigma(t), &mut edges));
+    edges
+}
+
+#[test]
+fn edges_never_decrease_and_cover_the_range() {
+    let mut rng = Rng::new(1, 0, 0);
+    for case in 0..2000 {
+        let sampling = Sampling {
+            count: 2 + rng.below(63),
+            step: 0.002 + 0.1 * rng.uniform(),
+            explore: rng.uniform() * 0.99,
+            sharpness: 2.0 * rng.uniform(),
+        };
+        let start = 3.0 * rng.uniform();
+        let range = (start, start + 1e-4 + 2.0 * rng.uniform());
+        // Thin enough that the light is not used up before the end.
+        let density = rng.uniform();
+        let wave = 40.0 * rng.uniform();
+        let e = edges(&sampling, range, rng.uniform(), |t| density * (1.0 + (wave * t).sin()));
+        assert!(e.windows(2).all(|w| w[0] <= w[1]), "case {case}: {e:?}");
+        assert_eq!(e[0], range.0, "case {case}");
+        assert!((e[sampling.count] - range.1).abs() < 1e-5 * range.1, "case {case}: {e:?}");
+    }
+}
+
+#[test]
+fn samples_gather_where_the_grid_is_dense() {
+    let e = edges(&SAMPLING, (0.0, 2.0), 0.5, |t| if (1.0..1.1).contains(&t) { 40.0 } else { 0.0 });
+    let inside = e.iter().filter(|t| (0.97..1.13).contains(*t)).count();
+    assert!(inside > SAMPLING.count / 2, "{inside} of {} edges at the wall: {e:?}", e.len());
+    // Some look elsewhere all the same.
+    assert!(e.iter().filter(|t| **t < 0.97).count() >= 2);
+}
+
+#[test]
+fn an_empty_grid_gives_even_samples() {
+    let e = edges(&SAMPLING, (1.0, 3.0), 0.5, |_| 0.0);
+    for w in e[1..SAMPLING.count].windows(2) {
+        assert!((w[1] - w[0] - 2.0 / SAMPLING.count as f32).abs() < 1e-3, "{e:?}");
+    }
+}
+
+#[test]
+fn nothing_is_placed_behind_a_wall() {
+    let e = edges(&SAMPLING, (0.0, 2.0), 0.5, |t| if t > 0.5 { 1e6 } else { 0.0 });
+    assert!(e[SAMPLING.count] < 0.6, "{e:?}");
+}
+
+#[test]
+fn extreme_densities_give_finite_edges() {
+    for sigma in [0.0, 1e-30, 1e30, f32::MAX] {
+        let e = edges(&SAMPLING, (0.1, 1.0), 0.0, |_| sigma);
+        assert!(e.iter().all(|t| t.is_finite()) && e.windows(2).all(|w| w[0] <= w[1]), "σ = {sigma}: {e:?}");
+    }
+}
+
+#[test]
+fn a_ray_that_misses_the_box_places_nothing() {
+    let mut edges = [0.0; 25];
+    assert!(!Sampler::default().edges(&ray(1.0, 1.0), &SAMPLING, 0.5, |_, _| 1.0, &mut edges));
+}

@@ -1,0 +1,339 @@
+//! Every gradient of a step against central differences of the f64 reference.
+
+use std::ops::Range;
+
+use super::reference::{Numbers, Reference};
+use super::*;
+use crate::field::Stream;
+use crate::field::hashgrid::FEATURES;
+use crate::field::mlp::Mlp;
+use crate::train::testing;
+
+/// Relative tolerance: f32 sums of a few hundred terms, with room for cancellation in them.
+const RELATIVE: f64 = 1e-3;
+
+/// Absolute tolerance, as a share of the group's largest gradient.
+const ABSOLUTE: f64 = 1e-5;
+
+/// Parameters of each group that are looked at by size, and as many at random.
+const LOOKED_AT: usize = 6;
+
+/// One chunk of a step: buffers as the kernels left them, and the gradients.
+struct Traced {
+    field: Field,
+    pixels: PixelSet,
+    config: LossConfig,
+    plan: StepPlan,
+    group: Group,
+    tables: [Vec<Vec<f32>>; 3],
+}
+
+/// A parameter.
+#[derive(Clone, Copy)]
+enum Place {
+    Table(usize, usize),
+    Weights,
+}
+
+/// Traces one chunk of a field whose numbers are all random, with holes in its density grids.
+fn trace(seed: u64) -> Traced {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let pixels = PixelSet::load(testing::frames(folder.path())).expect("frames that were just written");
+    let config = testing::config();
+    let mut field = Field::zeros(testing::shape(&config));
+    field.init(seed);
+    let mut rng = Rng::new(seed, 1, 0);
+    for row in field.tables.iter_mut().flatten().flatten() {
+        *row = Row::from_slice(&testing::noise(&mut rng, FEATURES, 0.5));
+    }
+    let layout = field.layout.clone();
+    let mut shake = |range: Range<usize>, size: f32| {
+        let noise = testing::noise(&mut rng, range.len(), size);
+        for (w, n) in field.weights[range].iter_mut().zip(noise) {
+            *w += n;
+        }
+    };
+    for r in &layout.streams {
+        // Biases, too, must not be zero.
+        shake(r.trunk.start..r.code.end, 0.1);
+    }
+    shake(layout.exposure.clone(), 0.1);
+    shake(layout.pose.clone(), 0.01);
+    shake(layout.rig.clone(), 0.01);
+    let mut grids = Grids::new(&field, config.train.grid_cells);
+    for sigma in grids.streams.iter_mut().flat_map(|g| &mut g.sigma) {
+        *sigma = if rng.uniform() < 0.2 { 0.0 } else { 0.1 + 4.0 * rng.uniform() };
+    }
+    grids.threshold = [0.05; 3];
+    // Every fourth chunk refines poses: the first one does at a step that is a multiple of four.
+    let mut plan = config.train.plan(4, 0.5, [true; 3]);
+    plan.pose_rate = 1.0;
+    plan.rig_rate = 1.0;
+    // Large enough that one per cent of a term is more than the tolerance.
+    let config = LossConfig { transient: 0.1, entropy: 0.5, exposure: 100.0, ..config.loss };
+    let mut traced =
+        Traced { field, pixels, config, plan, group: Group::default(), tables: Default::default() };
+    traced.run(&grids, seed);
+    traced
+}
+
+/// What a group does with one chunk.
+struct ChunkPass<'a> {
+    context: &'a Context<'a>,
+    group: &'a mut Group,
+    output: &'a mut ChunkOutput,
+}
+
+impl WithSimd for ChunkPass<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { context, group, output } = self;
+        let sampling = &context.plan.sampling;
+        group.choose_rays(context, 0);
+        group.chunk.forward(simd, context.model, context.views, &group.inputs, sampling);
+        let scale = 1.0 / context.rays as f32;
+        let Group { chunk, targets, gradient, .. } = &mut *group;
+        group.loss = loss::backward(context.config, chunk, targets, sampling.count, scale, gradient);
+        group.backward(simd, context, output, 0);
+    }
+}
+
+impl Traced {
+    fn run(&mut self, grids: &Grids, seed: u64) {
+        let Self { field, pixels, config, plan, group, tables } = self;
+        let views: Vec<View> = pixels.frames.iter().map(|f| View::new(field, f)).collect();
+        let model = Model::new(field, grids, plan.streams);
+        let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays: CHUNK_RAYS };
+        let mut outputs = [ChunkOutput::default()];
+        group.dense.resize(field.layout.len, 0.0);
+        pulp::Arch::new().dispatch(ChunkPass { context: &context, group, output: &mut outputs[0] });
+        for s in 0..3 {
+            let out = &outputs[0].streams[s];
+            let levels = field.nets[s].as_ref().expect("all streams are on").grid.levels.iter();
+            tables[s] = levels
+                .enumerate()
+                .map(|(n, level)| {
+                    let mut grad = vec![Row::ZERO; level.rows];
+                    let rows = &out.encoding[n * out.capacity..][..out.capacity];
+                    for (pos, g) in out.observed.positions.iter().zip(rows.chunks(TILE)) {
+                        level.scatter(&mut grad, pos, g);
+                    }
+                    bytemuck::cast_slice(&grad).to_vec()
+                })
+                .collect();
+        }
+    }
+
+    /// Calls `f` with the loss as a function of the field's numbers.
+    fn with_reference<T>(&self, f: impl FnOnce(&Reference) -> T) -> T {
+        let frames = &self.pixels.frames;
+        let views: Vec<View> = frames.iter().map(|f| View::new(&self.field, f)).collect();
+        let times: Vec<f32> = frames.iter().map(|f| f.time as f32).collect();
+        f(&Reference {
+            field: &self.field,
+            views: &views,
+            times: &times,
+            chunk: &self.group.chunk,
+            inputs: &self.group.inputs,
+            targets: &self.group.targets,
+            config: &self.config,
+            count: self.plan.sampling.count,
+        })
+    }
+
+    /// Name, place and range of every group of parameters.
+    fn groups(&self) -> Vec<(String, Place, Range<usize>)> {
+        let mut groups = Vec::new();
+        let layout = &self.field.layout;
+        for s in Stream::ALL {
+            let net = self.field.net(s).expect("all streams are on");
+            for (n, level) in net.grid.levels.iter().enumerate() {
+                let name = format!("table {n} of {}", s.name());
+                groups.push((name, Place::Table(s as usize, n), 0..level.rows * FEATURES));
+            }
+            let r = &layout.streams[s as usize];
+            for (part, net, start) in
+                [("trunk", &net.trunk, r.trunk.start), ("head", &net.head, r.head.start)]
+            {
+                for (layer, [weights, biases]) in layers(net, start).into_iter().enumerate() {
+                    for (kind, range) in [("weights", weights), ("biases", biases)] {
+                        let name = format!("{kind} of {part} layer {layer} of {}", s.name());
+                        groups.push((name, Place::Weights, range));
+                    }
+                }
+            }
+            if !r.code.is_empty() {
+                groups.push((format!("codes of {}", s.name()), Place::Weights, r.code.clone()));
+            }
+        }
+        let mut six = |name: &str, range: &Range<usize>, parts: [&str; 2]| {
+            for (part, first) in parts.iter().zip([0, 3]) {
+                for start in range.clone().step_by(6) {
+                    let range = start + first..start + first + 3;
+                    groups.push((format!("{name}: {part} {range:?}"), Place::Weights, range));
+                }
+            }
+        };
+        six("exposure", &layout.exposure, ["gain", "offset"]);
+        six("pose", &layout.pose, ["rotation", "translation"]);
+        six("rig", &(layout.rig.start..layout.rig.start + 6), ["rotation", "translation"]);
+        groups.push(("focal length".into(), Place::Weights, layout.rig.start + 6..layout.rig.end));
+        groups
+    }
+
+    fn gradient(&self, place: Place, range: Range<usize>) -> &[f32] {
+        match place {
+            Place::Table(s, n) => &self.tables[s][n][range],
+            Place::Weights => &self.group.dense[range],
+        }
+    }
+}
+
+/// Ranges of every layer's weights and biases.
+fn layers(net: &Mlp, mut start: usize) -> Vec<[Range<usize>; 2]> {
+    net.widths()
+        .windows(2)
+        .map(|w| {
+            let (a, b) = (start + w[0] * w[1], start + w[0] * w[1] + w[1]);
+            let layer = [start..a, a..b];
+            start = b;
+            layer
+        })
+        .collect()
+}
+
+/// Central difference of the loss by one number.
+fn difference(reference: &Reference, x: &mut Numbers, place: Place, n: usize, h: f64) -> f64 {
+    fn number(x: &mut Numbers, place: Place, n: usize) -> &mut f64 {
+        match place {
+            Place::Table(s, level) => &mut x.tables[s][level][n],
+            Place::Weights => &mut x.weights[n],
+        }
+    }
+    let before = *number(x, place, n);
+    *number(x, place, n) = before + h;
+    let above = reference.loss(x);
+    *number(x, place, n) = before - h;
+    let below = reference.loss(x);
+    *number(x, place, n) = before;
+    (above - below) / (2.0 * h)
+}
+
+/// Indices of the largest gradients, and some at random.
+fn choose(gradient: &[f32], rng: &mut Rng) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..gradient.len()).collect();
+    order.sort_by(|&a, &b| gradient[b].abs().total_cmp(&gradient[a].abs()));
+    order.truncate(LOOKED_AT);
+    order.extend((0..LOOKED_AT).map(|_| rng.below(gradient.len())));
+    order
+}
+
+/// Panics, naming the group, where a gradient and its finite difference disagree, or where nothing was compared because
+/// all are zero.
+fn assert_gradients_agree(group: &str, gradient: &[f64], numeric: &[f64]) {
+    let largest = numeric.iter().chain(gradient).fold(0.0f64, |m, v| m.max(v.abs()));
+    assert!(largest > 0.0, "{group}: all gradients are zero");
+    for (n, (g, d)) in gradient.iter().zip(numeric).enumerate() {
+        let allowed = RELATIVE * d.abs() + ABSOLUTE * largest;
+        assert!((g - d).abs() <= allowed, "{group}[{n}]: gradient {g:e}, finite difference {d:e}");
+    }
+}
+
+/// Compares all groups of one traced chunk.
+fn check(traced: &Traced, seed: u64) {
+    let mut rng = Rng::new(seed, 2, 0);
+    let mut x = Numbers::of(&traced.field);
+    traced.with_reference(|reference| {
+        let loss = traced.group.loss.total / CHUNK_RAYS as f64;
+        let truth = reference.loss(&x);
+        assert!((loss - truth).abs() < 1e-4 * truth.abs(), "loss {loss}, reference {truth}");
+        for (name, place, range) in traced.groups() {
+            let gradient = traced.gradient(place, range.clone());
+            let chosen = choose(gradient, &mut rng);
+            // A moving pose carries samples across cells, where the gradient jumps: the smaller step meets fewer.
+            let h = if range.start >= traced.field.layout.pose.start { 1e-8 } else { 1e-6 };
+            let numeric: Vec<f64> =
+                chosen.iter().map(|&n| difference(reference, &mut x, place, range.start + n, h)).collect();
+            let gradient: Vec<f64> = chosen.iter().map(|&n| f64::from(gradient[n])).collect();
+            assert_gradients_agree(&format!("seed {seed}, {name}"), &gradient, &numeric);
+        }
+    });
+}
+
+#[test]
+fn every_gradient_matches_finite_differences() {
+    for seed in [1, 2, 3] {
+        let traced = trace(seed);
+        let [p, d, a] = traced.group.chunk.batches.each_ref().map(|b| b.len());
+        let placed = traced.group.chunk.intervals.len();
+        assert!(p < placed && d < placed && a < placed, "some samples must be left out");
+        assert!(p.min(d).min(a) > placed / 8, "each stream must be evaluated somewhere");
+        check(&traced, seed);
+    }
+}
+
+#[test]
+fn directions_of_odd_cameras_project_back_to_their_pixels() {
+    let traced = trace(4);
+    for input in &traced.group.inputs {
+        let camera = &traced.pixels.frames[input.view as usize].camera;
+        let back = camera.project(input.dir_cam.as_dvec3()).expect("in front of the camera");
+        let pixel = input.uv.as_dvec2() * glam::DVec2::new(camera.width.into(), camera.height.into());
+        assert!((back - pixel).length() < 1e-3, "{pixel} came back as {back}");
+    }
+}
+
+#[test]
+#[should_panic(expected = "finite difference")]
+fn a_gradient_that_is_off_by_two_per_mille_is_found() {
+    assert_gradients_agree("negative control", &[1.0, 0.5 * 1.002, 0.1], &[1.0, 0.5, 0.1]);
+}
+
+#[test]
+#[should_panic(expected = "finite difference")]
+fn a_gradient_that_is_missing_is_found() {
+    assert_gradients_agree("negative control", &[1.0, 0.0], &[1.0, 1e-3]);
+}
+
+#[test]
+#[should_panic(expected = "all gradients are zero")]
+fn a_group_without_gradient_is_found() {
+    assert_gradients_agree("negative control", &[0.0; 2], &[0.0; 2]);
+}
+
+/// Each term of the loss, weighted 1 % differently in the reference, must make some group disagree.
+#[test]
+fn a_term_that_is_off_by_one_per_cent_is_found() {
+    let traced = trace(1);
+    let wrong: [fn(&mut LossConfig); 5] = [
+        |c| c.beta_min *= 1.01,
+        |c| c.transient *= 1.01,
+        |c| c.distortion *= 1.01,
+        |c| c.entropy *= 1.01,
+        |c| c.exposure *= 1.01,
+    ];
+    let mut x = Numbers::of(&traced.field);
+    for (term, wrong) in wrong.iter().enumerate() {
+        let mut config = traced.config.clone();
+        wrong(&mut config);
+        let found = traced.with_reference(|reference| {
+            let reference = Reference { config: &config, ..*reference };
+            traced.groups().into_iter().any(|(name, place, range)| {
+                // Biases and exposures see every term, and there are few of them.
+                if !(name.starts_with("biases") || name.starts_with("exposure")) {
+                    return false;
+                }
+                let gradient = traced.gradient(place, range.clone());
+                let mut differs = |(n, g): (usize, &f32)| {
+                    let d = difference(&reference, &mut x, place, range.start + n, 1e-6);
+                    let largest = gradient.iter().fold(0.0f64, |m, v| m.max(f64::from(*v).abs()));
+                    (f64::from(*g) - d).abs() > RELATIVE * d.abs() + ABSOLUTE * largest
+                };
+                gradient.iter().enumerate().any(&mut differs)
+            })
+        });
+        assert!(found, "term {term} could be wrong without anyone noticing");
+    }
+}

@@ -1,0 +1,255 @@
+//! Forward pass and loss of one chunk in plain f64 loops, written from the equations (docs/method.md) and not from the
+//! kernels.
+//!
+//! Taken over from the f32 pass as constants: the distances and lengths of the intervals, which samples each stream was
+//! evaluated at, and the viewing directions. Those are the constants of the gradient, too.
+
+use glam::{DMat3, DVec2, DVec3};
+
+use crate::field::codes::Trajectory;
+use crate::field::hashgrid::{FEATURES, Level};
+use crate::field::mlp::Mlp;
+use crate::field::stream::BETA_MAX;
+use crate::field::{Field, VIEW};
+use crate::render::forward::{Chunk, RayInput};
+use crate::render::rays::View;
+use crate::train::loss::{LossConfig, RayTarget};
+
+/// Everything that is learned, in f64.
+#[derive(Clone)]
+pub struct Numbers {
+    /// `[stream][level][row * FEATURES + feature]`.
+    pub tables: [Vec<Vec<f64>>; 3],
+    /// By the field's layout.
+    pub weights: Vec<f64>,
+}
+
+impl Numbers {
+    /// The field's numbers.
+    pub fn of(field: &Field) -> Self {
+        let wide = |t: &Vec<_>| bytemuck::cast_slice::<_, f32>(t).iter().map(|v| f64::from(*v)).collect();
+        Self {
+            tables: field.tables.each_ref().map(|levels| levels.iter().map(wide).collect()),
+            weights: field.weights.iter().map(|w| f64::from(*w)).collect(),
+        }
+    }
+}
+
+/// A traced chunk whose loss is asked for as a function of the field's numbers.
+pub struct Reference<'a> {
+    pub field: &'a Field,
+    pub views: &'a [View],
+    pub times: &'a [f32],
+    pub chunk: &'a Chunk,
+    pub inputs: &'a [RayInput],
+    pub targets: &'a [RayTarget],
+    pub config: &'a LossConfig,
+    pub count: usize,
+}
+
+#[derive(Clone, Copy, Default)]
+struct Sample {
+    sigma: f64,
+    rgb: [f64; 3],
+    beta: f64,
+}
+
+impl Reference<'_> {
+    /// Mean loss of the rays.
+    pub fn loss(&self, x: &Numbers) -> f64 {
+        let mut samples = vec![[Sample::default(); 3]; self.chunk.intervals.len()];
+        for s in 0..3 {
+            for &k in &self.chunk.batches[s].sample {
+                samples[k as usize][s] = self.evaluate(s, k as usize, x);
+            }
+        }
+        let rays = self.inputs.len();
+        let sum: f64 = (0..rays).map(|r| self.ray_loss(r, &samples[r * self.count..][..self.count], x)).sum();
+        sum / rays as f64
+    }
+
+    fn ray_loss(&self, r: usize, samples: &[[Sample; 3]], x: &Numbers) -> f64 {
+        let intervals = &self.chunk.intervals[r * self.count..][..self.count];
+        let c = self.config;
+        let mut light = 1.0;
+        let mut weights = Vec::new();
+        let (mut rgb, mut beta, mut transient, mut entropy) = ([0.0; 3], f64::from(c.beta_min), 0.0, 0.0);
+        let mut price = 0.0;
+        for (i, sample) in intervals.iter().zip(samples) {
+            let delta = f64::from(i.delta);
+            let sum: f64 = sample.iter().map(|s| s.sigma).sum();
+            let alpha = 1.0 - (-sum * delta).exp();
+            let mut total = 0.0;
+            for (s, sample) in sample.iter().enumerate() {
+                let w = if sum > 0.0 { light * alpha * sample.sigma / sum } else { 0.0 };
+                total += w;
+                for (o, v) in rgb.iter_mut().zip(sample.rgb) {
+                    *o += w * v;
+                }
+                if s > 0 {
+                    beta += w * sample.beta;
+                    transient += sample.sigma * delta;
+                    price += f64::from(c.transient_opacity[s - 1]) * w;
+                }
+            }
+            entropy += light * alpha * (1.0 - alpha);
+            weights.push((total, f64::from(i.t), delta));
+            light *= 1.0 - alpha;
+        }
+        let exposure = self.trajectory(&self.field.exposure, &self.field.layout.exposure, r, x);
+        let target = &self.targets[r];
+        let squared: f64 = (0..3)
+            .map(|k| {
+                let raw = rgb[k] + light * f64::from(target.background[k]);
+                (exposure[k].exp() * raw + exposure[3 + k] - f64::from(target.rgb[k])).powi(2)
+            })
+            .sum();
+        let mut distortion = 0.0;
+        for (w, t, delta) in &weights {
+            distortion += w * w * delta / 3.0;
+            distortion += weights.iter().map(|(v, u, _)| w * v * (t - u).abs()).sum::<f64>();
+        }
+        0.5 * squared / (beta * beta)
+            + beta.ln()
+            + price
+            + f64::from(c.transient) * transient
+            + f64::from(c.distortion) * distortion
+            + f64::from(c.entropy) * entropy
+            + f64::from(c.exposure) * 0.5 * exposure.iter().map(|e| e * e).sum::<f64>()
+    }
+
+    fn evaluate(&self, s: usize, k: usize, x: &Numbers) -> Sample {
+        let field = self.field;
+        let net = field.nets[s].as_ref().expect("only streams that exist are evaluated");
+        let ranges = &field.layout.streams[s];
+        let r = k / self.count;
+        let p = self.position(s, k, x);
+        let mut input = Vec::new();
+        let extent = if s == 2 { DVec3::ONE } else { field.normalisation.extent.as_dvec3() };
+        for (level, table) in net.grid.levels.iter().zip(&x.tables[s]) {
+            input.extend(interpolate(level, table, p, extent));
+        }
+        if let Some(code) = &field.codes[s] {
+            input.extend(self.trajectory(code, &ranges.code, r, x));
+        }
+        let geometry = network(&net.trunk, &x.weights[ranges.trunk.clone()], input);
+        let mut input = geometry.clone();
+        if net.view > 0 {
+            input.extend(harmonics(self.chunk.rays[r].ray.dir.as_dvec3().normalize()));
+        }
+        let out = network(&net.head, &x.weights[ranges.head.clone()], input);
+        Sample {
+            sigma: (geometry[0] + f64::from(net.density_bias)).exp(),
+            rgb: [0, 1, 2].map(|c| 1.0 / (1.0 + (-out[c]).exp())),
+            beta: f64::from(BETA_MAX) / (1.0 + (-out[3]).exp()),
+        }
+    }
+
+    /// World (persistent, dynamic) or frustum (actor) coordinates of sample `k`.
+    fn position(&self, s: usize, k: usize, x: &Numbers) -> DVec3 {
+        let field = self.field;
+        let r = k / self.count;
+        let input = &self.inputs[r];
+        let t = f64::from(self.chunk.intervals[k].t);
+        let dir = input.dir_cam.as_dvec3();
+        if s == 2 {
+            let (near, far) = (0.5 * f64::from(field.near), f64::from(field.actor_far));
+            let inverse = |z: f64| (1.0 / near - 1.0 / z) / (1.0 / near - 1.0 / far);
+            let uv: DVec2 = input.uv.as_dvec2();
+            return uv.extend(inverse(t * dir.z).clamp(0.0, 1.0));
+        }
+        let view = &self.views[input.view as usize];
+        let rig = &x.weights[field.layout.rig.clone()];
+        let mut pose = self.trajectory(&field.pose, &field.layout.pose, r, x);
+        for (p, shared) in pose.iter_mut().zip(rig) {
+            *p += shared;
+        }
+        let zoomed = DVec3::new(dir.x * (1.0 + rig[6]), dir.y * (1.0 + rig[6]), dir.z);
+        let turn = DVec3::new(pose[0], pose[1], pose[2]).cross(dir);
+        let axes: DMat3 = view.rotation.as_dmat3();
+        view.centre.as_dvec3() + axes * DVec3::new(pose[3], pose[4], pose[5]) + axes * (zoomed + turn) * t
+    }
+
+    /// z(t) = B(t) Γ for ray `r`, with B the hat functions, constant outside the knots.
+    fn trajectory(&self, of: &Trajectory, at: &std::ops::Range<usize>, r: usize, x: &Numbers) -> Vec<f64> {
+        let knots: Vec<f64> = of.knots.iter().map(|k| f64::from(*k)).collect();
+        let time =
+            f64::from(self.times[self.inputs[r].view as usize]).clamp(knots[0], knots[knots.len() - 1]);
+        let mut out = vec![0.0; of.width];
+        for (k, row) in x.weights[at.clone()].chunks_exact(of.width).enumerate() {
+            let rise = if k > 0 { (time - knots[k - 1]) / (knots[k] - knots[k - 1]) } else { 1.0 };
+            let fall =
+                if k + 1 < knots.len() { (knots[k + 1] - time) / (knots[k + 1] - knots[k]) } else { 1.0 };
+            let hat = rise.min(fall).clamp(0.0, 1.0);
+            for (o, v) in out.iter_mut().zip(row) {
+                *o += hat * v;
+            }
+        }
+        out
+    }
+}
+
+/// Trilinear interpolation of one level's rows.
+fn interpolate(level: &Level, table: &[f64], p: DVec3, extent: DVec3) -> [f64; FEATURES] {
+    let mut cell = [0u64; 3];
+    let mut frac = [0.0; 3];
+    let mut points = [0u64; 3];
+    for axis in 0..3 {
+        // The lattice is laid out in f32.
+        let cells = (extent[axis] as f32 * level.scale[axis]).ceil().max(1.0) as u64;
+        let q = p[axis] * f64::from(level.scale[axis]);
+        cell[axis] = (q.floor().max(0.0) as u64).min(cells - 1);
+        frac[axis] = (q - cell[axis] as f64).clamp(0.0, 1.0);
+        points[axis] = cells + 1;
+    }
+    let mut out = [0.0; FEATURES];
+    for corner in 0..8u64 {
+        let step = [corner & 1, corner >> 1 & 1, corner >> 2];
+        let at = [cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]];
+        let row = if level.dense {
+            at[0] + points[0] * (at[1] + points[1] * at[2])
+        } else {
+            // Instant-ngp's hash, modulo a power of two.
+            (at[0] ^ (at[1] * 2_654_435_761) ^ (at[2] * 805_459_861)) % level.rows as u64
+        };
+        let weight: f64 = (0..3).map(|a| if step[a] == 1 { frac[a] } else { 1.0 - frac[a] }).product();
+        for (o, v) in out.iter_mut().zip(&table[row as usize * FEATURES..]) {
+            *o += weight * v;
+        }
+    }
+    out
+}
+
+/// A fully connected network with ReLU between its layers; a short input is padded with zeros.
+pub fn network(net: &Mlp, params: &[f64], mut x: Vec<f64>) -> Vec<f64> {
+    let widths = net.widths();
+    let mut rest = params;
+    for (n, w) in widths.windows(2).enumerate() {
+        x.resize(w[0], 0.0);
+        let (weights, after) = rest.split_at(w[0] * w[1]);
+        let (bias, after) = after.split_at(w[1]);
+        rest = after;
+        let row = |o: usize| weights[o * w[0]..][..w[0]].iter().zip(&x).map(|(a, b)| a * b).sum::<f64>();
+        let y: Vec<f64> = (0..w[1]).map(|o| row(o) + bias[o]).collect();
+        let last = n + 2 == widths.len();
+        x = if last { y } else { y.into_iter().map(|v| v.max(0.0)).collect() };
+    }
+    x
+}
+
+/// Real spherical harmonics of degree 1 and 2, from their constants.
+fn harmonics(d: DVec3) -> [f64; VIEW] {
+    use std::f64::consts::PI;
+    let one = (3.0 / (4.0 * PI)).sqrt();
+    let two = (15.0 / (4.0 * PI)).sqrt();
+    [
+        one * d.y,
+        one * d.z,
+        one * d.x,
+        two * d.x * d.y,
+        two * d.y * d.z,
+        (5.0 / (16.0 * PI)).sqrt() * (3.0 * d.z * d.z - 1.0),
+        two * d.x * d.z,
+        0.5 * two * (d.x * d.x - d.y * d.y),
+    ]
+}

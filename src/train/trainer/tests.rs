@@ -1,0 +1,90 @@
+//! Whole trainings of a wall seen by three cameras.
+
+use std::ops::ControlFlow;
+
+use super::*;
+use crate::train::testing;
+
+/// Steps of the tests' schedules: two reports.
+const STEPS: u64 = 2 * REPORT_EVERY;
+
+fn config(static_until: f64) -> Config {
+    let mut config = testing::config();
+    config.train.steps = STEPS;
+    config.train.streams = StreamChoice::All;
+    config.train.static_until = static_until;
+    config
+}
+
+/// The checkpoint as bytes, without the one thing in it that no two trainings share.
+fn bytes(trainer: &mut Trainer) -> Vec<u8> {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    trainer.trained.progress.seconds = 0.0;
+    trainer.save(folder.path()).expect("the temporary folder can be written");
+    std::fs::read(Trained::path(folder.path())).expect("it was just written")
+}
+
+fn train(scene: &Scene, config: &Config, threads: usize) -> (Vec<u8>, Vec<Progress>) {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads can be started");
+    pool.install(|| {
+        let run = tempfile::tempdir().expect("a temporary folder");
+        let mut trainer = Trainer::new(scene, config).expect("the test's scene is valid");
+        let mut reports = Vec::new();
+        let mut watch = |p: &Progress| {
+            reports.push(*p);
+            ControlFlow::Continue(())
+        };
+        trainer.run(run.path(), None, &mut watch).expect("training goes through");
+        (bytes(&mut trainer), reports)
+    })
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_on_any_number_of_threads() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    let config = config(0.3);
+    let (one, _) = train(&scene, &config, 1);
+    let (two, _) = train(&scene, &config, 2);
+    assert!(one == two, "two threads give other bytes than one");
+    let (other, _) = train(&scene, &Config { seed: config.seed + 1, ..config }, 2);
+    assert!(one != other, "the seed must matter");
+}
+
+#[test]
+fn the_wall_is_learned() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut scene = testing::scene(folder.path());
+    // Looked at as a held-out frame, too, so that rendering is measured.
+    let mut held_out = scene.frames[0].clone();
+    held_out.split = Split::Test;
+    scene.frames.push(held_out);
+    let mut config = config(1.0);
+    config.train.steps = 4 * REPORT_EVERY;
+    let (_, reports) = train(&scene, &config, 2);
+    let (first, last) = (&reports[0], &reports[reports.len() - 1]);
+    assert!(last.loss < first.loss, "the loss went from {} to {}", first.loss, last.loss);
+    assert!(last.psnr > first.psnr + 3.0, "the rays' PSNR went from {} to {}", first.psnr, last.psnr);
+    let seen = last.test_psnr.expect("there is a held-out frame");
+    assert!(seen > 18.0, "a frame that was trained on has {seen} dB");
+}
+
+#[test]
+fn resuming_gives_the_bytes_of_an_uninterrupted_training() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    // Interrupted half-way: once after the streams are settled, once before.
+    for static_until in [0.2, 0.7] {
+        let config = config(static_until);
+        let (straight, _) = train(&scene, &config, 2);
+        let run = tempfile::tempdir().expect("a temporary folder");
+        let mut first = Trainer::new(&scene, &config).expect("the test's scene is valid");
+        first.run(run.path(), None, &mut |_| ControlFlow::Break(())).expect("training goes through");
+        assert_eq!(first.trained().progress.step, REPORT_EVERY);
+        drop(first);
+        let mut second = Trainer::resume(&scene, &config, run.path()).expect("the checkpoint is whole");
+        second.run(run.path(), None, &mut |_| ControlFlow::Continue(())).expect("training goes through");
+        assert_eq!(second.trained().progress.step, STEPS);
+        assert!(bytes(&mut second) == straight, "static until {static_until}: resumed to other bytes");
+    }
+}
