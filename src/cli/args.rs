@@ -1,9 +1,11 @@
 //! The command line as clap sees it; plain data, turned into settings by the commands.
 
 use std::path::PathBuf;
+use std::str::FromStr;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use divff::map::Times;
 
 /// Semantic 3D maps from egocentric video, on a plain CPU.
 #[derive(Debug, Parser)]
@@ -35,6 +37,9 @@ pub enum Command {
     #[command(after_help = "Ctrl-C stops with a checkpoint; the same command goes on from there.\n\n\
         Example:\n  divff train kitchen --out runs/kitchen --set train.steps=9000")]
     Train(RunArgs),
+    /// Write meshes and points of a trained run
+    #[command(after_help = "Example:\n  divff export runs/kitchen --out map --formats glb,ply --voxel 0.02")]
+    Export(ExportArgs),
     /// Render frames of a trained run: <stem>.png (sRGB) and <stem>.exr (all layers)
     #[command(after_help = "Example:\n  divff render runs/kitchen --split test --layers rgb,depth,stream \
         --out views")]
@@ -56,6 +61,9 @@ pub struct DemoArgs {
     /// Seed of the scene and of the training
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
+    /// Time for training; the rest takes about a minute
+    #[arg(long, value_name = "TIME", default_value = "75s", value_parser = parse_duration)]
+    pub time_budget: Duration,
 }
 
 /// `divff synth`.
@@ -124,6 +132,19 @@ pub struct SettingsArgs {
     pub time_budget: Option<Duration>,
 }
 
+/// File formats of an export.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum FormatArg {
+    /// glTF binary: Blender, the web
+    Glb,
+    /// PLY: Open3D, CloudCompare, MeshLab
+    Ply,
+    /// NumPy archive with the points
+    Npz,
+    /// Rendered test frames with depth and streams, in views/
+    Exr,
+}
+
 /// The three streams.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum StreamArg {
@@ -133,6 +154,31 @@ pub enum StreamArg {
     Dynamic,
     /// Who moves it
     Actor,
+}
+
+/// `divff export`.
+#[derive(Debug, Args)]
+pub struct ExportArgs {
+    /// Folder of a trained run
+    pub run: PathBuf,
+    /// Folder for the map
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// File formats
+    #[arg(long, value_enum, value_delimiter = ',', default_values = ["glb", "ply", "npz"])]
+    pub formats: Vec<FormatArg>,
+    /// Streams
+    #[arg(long, value_enum, value_delimiter = ',', default_values = ["persistent", "dynamic", "actor"])]
+    pub streams: Vec<StreamArg>,
+    /// Times of dynamic and actor geometry: auto, all, times in [0, 1] such as 0.1,0.5, or frame:12
+    #[arg(long, default_value = "auto", value_parser = Times::from_str)]
+    pub times: Times,
+    /// Side of a voxel, world units [default: 1/350 of the diagonal of the scene's box]
+    #[arg(long, value_name = "LENGTH")]
+    pub voxel: Option<f64>,
+    /// Where the scene is, if it was moved
+    #[arg(long, value_name = "SCENE")]
+    pub scene: Option<PathBuf>,
 }
 
 /// Which frames are rendered.
@@ -260,6 +306,6 @@ mod tests {
     #[test]
     fn what_does_not_exist_yet_is_not_offered() {
         let names: Vec<String> = Cli::command().get_subcommands().map(|c| c.get_name().to_owned()).collect();
-        assert_eq!(names, ["demo", "synth", "run", "train", "render", "eval", "inspect"]);
+        assert_eq!(names, ["demo", "synth", "run", "train", "export", "render", "eval", "inspect"]);
     }
 }

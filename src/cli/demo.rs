@@ -1,6 +1,7 @@
 //! `synth` and `demo`.
 
 use std::fs;
+use std::path::Path;
 
 use divff::config::{Config, Preset};
 use divff::pipeline::{self, Outcome, RunFolder, RunOptions};
@@ -12,9 +13,6 @@ use super::output::say;
 use super::progress::Reporter;
 use super::run::{open, summary};
 use super::stop::StopFlag;
-
-/// Seconds of training in the demo, so that everything is over in three minutes on two cores.
-const TRAINING_SECONDS: f64 = 75.0;
 
 /// `divff synth`.
 pub fn synth(args: &SynthArgs) -> Result<(), CliError> {
@@ -40,7 +38,7 @@ pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
     let scene = open(&scene_path, &reporter)?;
     let mut config = Config::preset(Preset::Draft);
     config.seed = args.seed;
-    config.time_budget_s = Some(TRAINING_SECONDS);
+    config.time_budget_s = Some(args.time_budget.as_secs_f64());
     let outcome = pipeline::run(&scene, &config, &run_path, &RunOptions::default(), &mut reporter)?;
     drop(reporter);
     match outcome {
@@ -53,7 +51,7 @@ pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
 }
 
 /// Removes the pictures of a scene whose making was cut off; nothing else is ever in this folder.
-fn clear_half_made(scene: &std::path::Path) -> Result<(), CliError> {
+fn clear_half_made(scene: &Path) -> Result<(), CliError> {
     match fs::remove_dir_all(scene) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(CliError::Input {
             path: scene.to_owned(),

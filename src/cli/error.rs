@@ -1,10 +1,13 @@
 //! The one place where errors become exit codes.
 
+use std::error::Error;
+use std::io::{self, ErrorKind};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use divff::config::ConfigError;
 use divff::eval::EvalError;
+use divff::map::MapError;
 use divff::pipeline::PipelineError;
 use divff::scene::SceneError;
 use divff::synth::SynthError;
@@ -75,6 +78,23 @@ impl From<divff_exporters::Error> for CliError {
 }
 
 impl CliError {
+    /// What to do, where the system's own word does not say it.
+    pub fn hint(&self) -> Option<&'static str> {
+        let mut cause: Option<&(dyn Error + 'static)> = Some(self);
+        while let Some(error) = cause {
+            if let Some(io) = error.downcast_ref::<io::Error>() {
+                return match io.kind() {
+                    ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => {
+                        Some("make room on that disk and give the same command again")
+                    }
+                    _ => None,
+                };
+            }
+            cause = error.source();
+        }
+        None
+    }
+
     /// 2 where the usage or the input is at fault, 1 for everything else.
     pub fn exit_code(&self) -> ExitCode {
         let input_is_bad = match self {
@@ -98,6 +118,9 @@ fn is_input(error: &PipelineError) -> bool {
                 | TrainError::NoPixels
                 | TrainError::Checkpoint { .. }
         ),
+        E::Map(error) => {
+            matches!(**error, MapError::Scene(_) | MapError::Config(_) | MapError::NoSuchFrame { .. })
+        }
         E::Eval(error) => !matches!(**error, EvalError::NonFinite { .. } | EvalError::Render { .. }),
         _ => false,
     }

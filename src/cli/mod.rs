@@ -15,6 +15,7 @@ use std::process::ExitCode;
 use args::{Cli, Command};
 use clap::Parser;
 use error::CliError;
+use output::tell;
 use stop::StopFlag;
 
 /// Parses the command line and does what it says.
@@ -23,7 +24,10 @@ pub fn main() -> ExitCode {
     match dispatch(cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error}");
+            match error.hint() {
+                Some(hint) => tell(format_args!("error: {error}; {hint}")),
+                None => tell(format_args!("error: {error}")),
+            }
             error.exit_code()
         }
     }
@@ -43,6 +47,7 @@ fn dispatch(cli: Cli) -> Result<(), CliError> {
         Command::Synth(args) => demo::synth(args),
         Command::Run(args) => run::run(args, stop()?),
         Command::Train(args) => run::train(args, stop()?),
+        Command::Export(args) => run::export(args, stop()?),
         Command::Render(args) => run::render(args, stop()?),
         Command::Eval(args) => run::eval(args, stop()?),
         Command::Inspect(args) => inspect::inspect(args),

@@ -3,10 +3,12 @@
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
+use divff::map;
 use divff::pipeline::{Event, Observer, Stage};
 use divff::train::Progress;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
+use super::output::tell;
 use super::stop::StopFlag;
 
 /// Between two lines where there is no terminal.
@@ -35,8 +37,8 @@ impl Reporter {
     /// Says something that stays on the screen.
     pub fn note(&self, text: &str) {
         match self.terminal {
-            true => self.bar.suspend(|| eprintln!("{text}")),
-            false => eprintln!("{text}"),
+            true => self.bar.suspend(|| tell(text)),
+            false => tell(text),
         }
     }
 
@@ -45,7 +47,7 @@ impl Reporter {
         self.stage_start = Instant::now();
         self.last_line = None;
         if !self.terminal {
-            eprintln!("{what}");
+            tell(what);
             return;
         }
         self.bar = ProgressBar::with_draw_target(Some(BAR_LENGTH), ProgressDrawTarget::stderr());
@@ -65,7 +67,7 @@ impl Reporter {
         }
         let due = self.last_line.unwrap_or(self.stage_start).elapsed() >= LINE_EVERY;
         if due || fraction >= 1.0 {
-            eprintln!("  {:3.0} %  {}", 100.0 * fraction, text());
+            tell(format_args!("  {:3.0} %  {}", 100.0 * fraction, text()));
             self.last_line = Some(Instant::now());
         }
     }
@@ -93,6 +95,7 @@ impl Observer for Reporter {
                 Stage::Training => "training",
                 Stage::Mapping => "mapping",
                 Stage::Exporting => "exporting",
+                Stage::Rendering => "rendering",
                 Stage::Evaluating => "evaluating",
                 Stage::Reporting => "reporting",
             }),
@@ -103,6 +106,20 @@ impl Observer for Reporter {
                 self.note(&format!("already trained ({step} steps); --fresh starts over"));
             }
             Event::Training(progress) => self.training(progress),
+            Event::Mapping(p) => {
+                // Stages differ in length; each counts as one part of the bar.
+                let stages = [
+                    (map::Stage::Depth, "depth of all frames"),
+                    (map::Stage::Persistent, "what stays"),
+                    (map::Stage::Dynamic, "what is moved"),
+                    (map::Stage::Actor, "who moves it"),
+                    (map::Stage::Points, "points"),
+                ];
+                let part = stages.iter().position(|(s, _)| *s == p.stage).unwrap_or(0);
+                let inside = p.done as f64 / p.total.max(1) as f64;
+                let fraction = (part as f64 + inside) / stages.len() as f64;
+                self.advance(fraction, || format!("{} ({} of {})", stages[part].1, p.done, p.total));
+            }
             Event::Views { done, total } => {
                 self.advance(*done as f64 / (*total).max(1) as f64, || format!("frame {done} of {total}"));
             }

@@ -2,12 +2,16 @@
 
 use std::path::Path;
 
+use divff::config::Config;
+use divff::field::Stream;
+use divff::map::Format;
 use divff::pipeline::folder::{create_writable, write_json};
 use divff::pipeline::{self, Cost, Event, Observer, Outcome, RunFolder, RunMetrics, RunOptions, Stage};
 use divff::render::views::Layer;
 use divff::scene::{Frame, Scene, Split};
+use divff::train::Trained;
 
-use super::args::{EvalArgs, LayerArg, RenderArgs, RunArgs, SplitArg, StreamArg};
+use super::args::{EvalArgs, ExportArgs, FormatArg, LayerArg, RenderArgs, RunArgs, SplitArg, StreamArg};
 use super::error::CliError;
 use super::output::say;
 use super::progress::{Reporter, human};
@@ -46,6 +50,57 @@ pub fn train(args: &RunArgs, stop: StopFlag) -> Result<(), CliError> {
     say(format_args!("trained {} steps in {}", progress.step, human(progress.seconds)))
 }
 
+/// `divff export`.
+pub fn export(args: &ExportArgs, stop: StopFlag) -> Result<(), CliError> {
+    let run = RunFolder::open(&args.run)?;
+    let mut reporter = Reporter::new(stop);
+    let scene = run.scene(args.scene.as_deref())?;
+    let mut config = run.config()?;
+    let wanted = chosen_streams(&args.streams);
+    config.map.streams = Stream::ALL.into_iter().filter(|s| wanted[*s as usize]).collect();
+    config.map.times = args.times.clone();
+    config.map.voxel_size = args.voxel.or(config.map.voxel_size);
+    config.validate()?;
+    create_writable(&args.out)?;
+    let trained = run.trained()?;
+    let formats: Vec<Format> = args.formats.iter().filter_map(|f| map_format(*f)).collect();
+    let views = match args.formats.contains(&FormatArg::Exr) {
+        true => export_views(&scene, &trained, &config, &args.out, &mut reporter)?,
+        false => Vec::new(),
+    };
+    let cost = &mut Cost::default();
+    let manifest = pipeline::export_map(&scene, &trained, &config, &args.out, &formats, cost, &mut reporter)?;
+    drop(reporter);
+    let Some(mut manifest) = manifest else { return Err(CliError::Interrupted) };
+    if !views.is_empty() {
+        for file in &views {
+            manifest.add_file(&args.out, file, 0, 0)?;
+        }
+        manifest.write(&args.out)?;
+    }
+    for s in &manifest.skipped {
+        say(format_args!("skipped {}: {}", s.what, s.why))?;
+    }
+    say(format_args!("{} files in {}", manifest.files.len(), args.out.display()))
+}
+
+/// Renders the test frames into `views/` of an export; the files' paths relative to it.
+fn export_views(
+    scene: &Scene,
+    trained: &Trained,
+    config: &Config,
+    out: &Path,
+    reporter: &mut Reporter,
+) -> Result<Vec<String>, CliError> {
+    let frames: Vec<&Frame> = scene.frames.iter().filter(|f| f.split == Split::Test).collect();
+    let layers = [Layer::Rgb, Layer::Depth, Layer::Normal, Layer::Stream];
+    reporter.event(&Event::Stage(Stage::Rendering));
+    let folder = out.join("views");
+    let done = pipeline::render_views(trained, config, &frames, [true; 3], &layers, &folder, reporter)?;
+    let names = |f: &&Frame| ["exr", "png"].map(|kind| format!("views/{}.{kind}", f.stem));
+    Ok(frames[..done].iter().flat_map(names).collect())
+}
+
 /// `divff render`.
 pub fn render(args: &RenderArgs, stop: StopFlag) -> Result<(), CliError> {
     let run = RunFolder::open(&args.run)?;
@@ -58,7 +113,7 @@ pub fn render(args: &RenderArgs, stop: StopFlag) -> Result<(), CliError> {
     let mut layers: Vec<Layer> = args.layers.iter().map(|l| layer(*l)).collect();
     layers.sort();
     layers.dedup();
-    reporter.event(&Event::Stage(Stage::Evaluating));
+    reporter.event(&Event::Stage(Stage::Rendering));
     let done =
         pipeline::render_views(&trained, &config, &frames, streams, &layers, &args.out, &mut reporter)?;
     drop(reporter);
@@ -120,6 +175,16 @@ fn chosen_frames<'a>(args: &RenderArgs, scene: &'a Scene) -> Result<Vec<&'a Fram
 
 fn chosen_streams(streams: &[StreamArg]) -> [bool; 3] {
     [StreamArg::Persistent, StreamArg::Dynamic, StreamArg::Actor].map(|s| streams.contains(&s))
+}
+
+/// `None` for what is not a file of the map but a view.
+fn map_format(format: FormatArg) -> Option<Format> {
+    match format {
+        FormatArg::Glb => Some(Format::Glb),
+        FormatArg::Ply => Some(Format::Ply),
+        FormatArg::Npz => Some(Format::Npz),
+        FormatArg::Exr => None,
+    }
 }
 
 fn layer(layer: LayerArg) -> Layer {

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::error::CliError;
+use super::output::tell;
 
 /// What shells report for a program that Ctrl-C ended: 128 + SIGINT.
 const INTERRUPTED: i32 = 130;
@@ -21,7 +22,7 @@ impl StopFlag {
             if handler.0.swap(true, Ordering::SeqCst) {
                 std::process::exit(INTERRUPTED);
             }
-            eprintln!("stopping … (Ctrl-C again stops at once, without storing anything)");
+            tell("stopping … (Ctrl-C again stops at once, without storing anything)");
         })
         .map_err(|e| CliError::Start(format!("no handler for Ctrl-C: {e}")))?;
         Ok(flag)

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use crate::config::ConfigError;
 use crate::eval::EvalError;
+use crate::map::MapError;
 use crate::scene::SceneError;
 use crate::train::TrainError;
 
@@ -20,6 +21,9 @@ pub enum PipelineError {
     /// Training failed.
     #[error(transparent)]
     Train(#[from] Box<TrainError>),
+    /// The map cannot be built or written.
+    #[error(transparent)]
+    Map(#[from] Box<MapError>),
     /// The result cannot be compared with the truth.
     #[error(transparent)]
     Eval(#[from] Box<EvalError>),
@@ -85,6 +89,12 @@ impl From<SceneError> for PipelineError {
 impl From<TrainError> for PipelineError {
     fn from(error: TrainError) -> Self {
         Self::Train(Box::new(error))
+    }
+}
+
+impl From<MapError> for PipelineError {
+    fn from(error: MapError) -> Self {
+        Self::Map(Box::new(error))
     }
 }
 

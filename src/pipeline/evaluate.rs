@@ -3,6 +3,8 @@
 use std::path::Path;
 use std::time::Instant;
 
+use divff_exporters::Manifest;
+
 use super::folder::create_writable;
 use super::metrics::{RunMetrics, peak_rss_mb, skipped_in_training};
 use super::{Cost, Event, Observer, PipelineError, RunFolder};
@@ -10,6 +12,7 @@ use crate::config::Config;
 use crate::eval::{self, RenderedView};
 use crate::render::forward::Model;
 use crate::render::image::{RenderedFrame, render};
+use crate::render::refined::refined_camera;
 use crate::render::views::{Layer, quantised, write_view};
 use crate::scene::{Frame, Scene, Split};
 use crate::train::Trained;
@@ -40,7 +43,9 @@ pub fn render_views(
             return Ok(done);
         }
         let image = render(&model, frame, &sampling, 1);
-        write_view(out, &frame.stem, &image, &frame.camera, &frame.c2w, layers, Vec::new())?;
+        // Normals follow from the camera that the picture really was taken with.
+        let (camera, c2w) = refined_camera(&trained.field, frame);
+        write_view(out, &frame.stem, &image, &camera, &c2w, layers, Vec::new())?;
         observer.event(&Event::Views { done: done + 1, total: frames.len() });
     }
     Ok(frames.len())
@@ -79,15 +84,21 @@ pub fn evaluate(
     if observer.stop() {
         return Ok(None);
     }
-    if run.map().is_dir() {
-        eval::evaluate_geometry(scene, &run.map(), &mut quality)?;
-    } else {
-        quality.absent.insert("persistent".into(), "the run has no map".into());
+    let mut skipped = skipped_in_training(&trained.progress, trained.field.shape.streams);
+    // Without a manifest the files there are, if any, are not a whole map.
+    match Manifest::read(&run.map()) {
+        Ok(manifest) => {
+            eval::evaluate_geometry(scene, &run.map(), &mut quality)?;
+            let reasons = manifest.skipped.into_iter().map(|s| (s.what, s.why.into())).collect();
+            skipped.insert("map".to_owned(), serde_json::Value::Object(reasons));
+        }
+        Err(_) => {
+            quality.absent.insert("persistent".into(), "the run has no complete map".into());
+        }
     }
     cost.set_training(&trained.progress);
     cost.eval_seconds = Some(start.elapsed().as_secs_f64());
     cost.peak_rss_mb = peak_rss_mb();
-    let skipped = skipped_in_training(&trained.progress, trained.field.shape.streams);
     Ok(Some(RunMetrics { quality, cost, skipped }))
 }
 

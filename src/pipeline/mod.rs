@@ -8,6 +8,7 @@ mod evaluate;
 mod fingerprint;
 pub mod folder;
 pub mod log;
+mod map;
 pub mod metrics;
 mod train;
 
@@ -17,10 +18,12 @@ pub use error::PipelineError;
 pub use evaluate::{evaluate, render_views};
 pub use fingerprint::fingerprint;
 pub use folder::{RunFolder, RunRecord};
+pub use map::export_map;
 pub use metrics::{Cost, RunMetrics};
 pub use train::train;
 
 use crate::config::Config;
+use crate::map::Format;
 use crate::scene::Scene;
 use crate::train::Progress;
 
@@ -33,6 +36,8 @@ pub enum Stage {
     Mapping,
     /// The map is written.
     Exporting,
+    /// Frames are rendered to files.
+    Rendering,
     /// Test frames are rendered and everything is compared with the truth.
     Evaluating,
     /// `report.html` is written.
@@ -59,6 +64,8 @@ pub enum Event<'a> {
     },
     /// Training moves on.
     Training(&'a Progress),
+    /// The map is being built.
+    Mapping(crate::map::Progress),
     /// Frames are being rendered.
     Views {
         /// Frames done.
@@ -119,11 +126,16 @@ pub fn run(
     observer: &mut dyn Observer,
 ) -> Result<Outcome, PipelineError> {
     let run = RunFolder::new(out);
-    let cost = Cost::default();
+    let mut cost = Cost::default();
     observer.event(&Event::Stage(Stage::Training));
     let trained = train(scene, config, &run, options.fresh, observer)?;
     let stopped = Outcome::Stopped { step: trained.progress.step };
     if !trained.progress.finished {
+        return Ok(stopped);
+    }
+    let map = run.map();
+    let manifest = export_map(scene, &trained, config, &map, &Format::ALL, &mut cost, observer)?;
+    if manifest.is_none() {
         return Ok(stopped);
     }
     observer.event(&Event::Stage(Stage::Evaluating));

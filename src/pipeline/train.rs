@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::ops::ControlFlow;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use super::fingerprint::fingerprint;
@@ -31,26 +32,24 @@ pub fn train(
     if fresh {
         discard(run)?;
     }
-    let goes_on = run.record_path().is_file() && {
+    let mut trainer = if run.has_checkpoint() {
         check_same(scene, config, run)?;
-        run.has_checkpoint()
-    };
-    run.write_record(scene, config)?;
-    let mut trainer = match goes_on {
-        true => {
-            // Without the optimiser's state and the pixels: a finished run needs neither.
-            let trained = run.trained()?;
-            if trained.progress.finished {
-                observer.event(&Event::AlreadyTrained { step: trained.progress.step });
-                return Ok(trained);
-            }
-            observer
-                .event(&Event::Resuming { step: trained.progress.step, seconds: trained.progress.seconds });
-            drop(trained);
-            Trainer::resume(scene, config, run.root())?
+        // Without the optimiser's state and the pixels: a finished run needs neither.
+        let trained = run.trained()?;
+        let progress = trained.progress.clone();
+        if progress.finished {
+            run.write_record(scene, config)?;
+            observer.event(&Event::AlreadyTrained { step: progress.step });
+            return Ok(trained);
         }
-        false => Trainer::new(scene, config)?,
+        drop(trained);
+        observer.event(&Event::Resuming { step: progress.step, seconds: progress.seconds });
+        Trainer::resume(scene, config, run.root())?
+    } else {
+        Trainer::new(scene, config)?
     };
+    // Not before the scene has been read: a folder whose scene was broken is not yet a run.
+    run.write_record(scene, config)?;
     let mut log = Log::resume(&run.log_path(), trainer.trained().progress.step)?;
     let mut failed = None;
     let budget = config.time_budget_s.map(Duration::from_secs_f64);
@@ -89,20 +88,26 @@ fn check_same(scene: &Scene, config: &Config, run: &RunFolder) -> Result<(), Pip
     }
 }
 
-/// Removes what an earlier run left, so that nothing of it can be taken for a result of this one.
+/// Removes what an earlier run left, so that nothing of it can be taken for a result of this one. A folder that is not
+/// a run is left alone.
 fn discard(run: &RunFolder) -> Result<(), PipelineError> {
-    let gone = |path: std::path::PathBuf, result: std::io::Result<()>| match result {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(PipelineError::Io { path, source: e }),
+    if !run.has_checkpoint() && !run.record_path().is_file() {
+        return Ok(());
+    }
+    let gone = |path: PathBuf, result: std::io::Result<()>| match result {
+        Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
+            Err(PipelineError::Io { path, source })
+        }
         _ => Ok(()),
     };
-    // The record last: while it is there, the folder is known to be a run.
-    for folder in [run.root().join("checkpoint"), run.map(), run.views()] {
-        let result = if run.record_path().is_file() { fs::remove_dir_all(&folder) } else { Ok(()) };
+    for folder in [run.map(), run.views(), run.root().join("checkpoint")] {
+        let result = fs::remove_dir_all(&folder);
         gone(folder, result)?;
     }
+    // The record last: while it is there, the folder is known to be a run.
     for file in [run.log_path(), run.metrics_path(), run.report_path(), run.config_path(), run.record_path()]
     {
-        let result = if run.record_path().is_file() { fs::remove_file(&file) } else { Ok(()) };
+        let result = fs::remove_file(&file);
         gone(file, result)?;
     }
     Ok(())

@@ -198,6 +198,13 @@ impl Page<'_> {
         section(out, "Skipped", |out| {
             table(out, &["what", "how much"]);
             for (what, value) in &self.metrics.skipped {
+                if let serde_json::Value::Object(reasons) = value {
+                    for (item, why) in reasons {
+                        let why = why.as_str().unwrap_or_default();
+                        cells(out, &escaped(&format!("{what}: {item}")), &[escaped(why)]);
+                    }
+                    continue;
+                }
                 let value = match value {
                     serde_json::Value::Array(all) if all.is_empty() => "none".to_owned(),
                     serde_json::Value::Array(all) => {

@@ -1,0 +1,43 @@
+//! From a trained run to the files of its map.
+
+use std::path::Path;
+use std::time::Instant;
+
+use divff_exporters::Manifest;
+
+use super::folder::create_writable;
+use super::{Cost, Event, Observer, PipelineError, Stage};
+use crate::config::Config;
+use crate::map::{self, Format};
+use crate::scene::Scene;
+use crate::train::Trained;
+
+/// Builds the map of a trained field and writes it to `out`, with the times that it took into `cost`.
+///
+/// `None` if the observer said stop; the folder then holds no manifest, or an earlier map.
+///
+/// # Errors
+/// The map cannot be built, or a file cannot be written.
+pub fn export_map(
+    scene: &Scene,
+    trained: &Trained,
+    config: &Config,
+    out: &Path,
+    formats: &[Format],
+    cost: &mut Cost,
+    observer: &mut dyn Observer,
+) -> Result<Option<Manifest>, PipelineError> {
+    create_writable(out)?;
+    observer.event(&Event::Stage(Stage::Mapping));
+    let start = Instant::now();
+    let map = map::build(scene, trained, config, &mut |p| observer.event(&Event::Mapping(p)))?;
+    cost.extract_seconds = Some(start.elapsed().as_secs_f64());
+    if observer.stop() {
+        return Ok(None);
+    }
+    observer.event(&Event::Stage(Stage::Exporting));
+    let start = Instant::now();
+    let manifest = map::write(&map, out, formats)?;
+    cost.export_seconds = Some(start.elapsed().as_secs_f64());
+    Ok(Some(manifest))
+}
