@@ -70,7 +70,8 @@ fn trace(seed: u64) -> Traced {
     plan.pose_rate = 1.0;
     plan.rig_rate = 1.0;
     // Large enough that one per cent of a term is more than the tolerance.
-    let config = LossConfig { transient: 0.1, distortion: 10.0, entropy: 0.5, exposure: 100.0, ..config.loss };
+    let config =
+        LossConfig { transient: 0.1, distortion: 10.0, entropy: 5.0, exposure: 100.0, ..config.loss };
     let mut traced =
         Traced { field, pixels, config, plan, group: Group::default(), tables: Default::default() };
     traced.run(&grids, seed);
