@@ -13,9 +13,9 @@ use crate::field::Stream;
 #[serde(rename_all = "lowercase")]
 pub enum SurfaceMethod {
     /// Rendered median depth of all training frames, fused into a signed distance and marched at 0.
-    #[default]
     Tsdf,
     /// The density on a grid, marched where a voxel's opacity is one half.
+    #[default]
     Density,
 }
 
@@ -143,11 +143,11 @@ impl Default for MapConfig {
     fn default() -> Self {
         Self {
             voxel_size: None,
-            method: SurfaceMethod::Tsdf,
+            method: SurfaceMethod::Density,
             times: Times::Auto,
             streams: Stream::ALL.to_vec(),
             points: 200_000,
-            depth_rays: 4_000_000,
+            depth_rays: 1_500_000,
             depth_samples: 32,
             min_views: 0.5,
             dynamic_views: 12,

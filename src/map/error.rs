@@ -13,7 +13,7 @@ pub enum MapError {
     Config(#[from] ConfigError),
     /// A frame's image or mask cannot be read.
     #[error(transparent)]
-    Scene(#[from] SceneError),
+    Scene(Box<SceneError>),
     /// The surface cannot be extracted.
     #[error("extracting the {what} surface: {source}")]
     Extract {
@@ -43,6 +43,12 @@ pub enum MapError {
         /// What the system says.
         source: std::io::Error,
     },
+}
+
+impl From<SceneError> for MapError {
+    fn from(error: SceneError) -> Self {
+        Self::Scene(Box::new(error))
+    }
 }
 
 impl MapError {

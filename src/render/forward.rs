@@ -201,9 +201,9 @@ impl Chunk {
         let n = sampling.count;
         self.place_samples(model, views, inputs, sampling);
         let Self { codes, rays, intervals, weighted, batches, samples, .. } = self;
-        for s in 0..3 {
+        for (s, samples) in samples.iter_mut().enumerate() {
             let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
-            let sigma = &mut samples[s].sigma;
+            let sigma = &mut samples.sigma;
             sigma.clear();
             sigma.resize(batches[s].len(), 0.0);
             let code = |k: u32| &codes[s][k as usize / n * net.code..];
