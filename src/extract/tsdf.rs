@@ -2,7 +2,7 @@
 //!
 //! First every frame marks the blocks that its depth passes within the truncation distance. Then every block
 //! looks at all frames, in order: blocks share nothing, so there are no races and the sums are the same for
-//! any number of threads. The fused value is positive inside, so the surface is [`super::march`] at 0;
+//! any number of threads. The fused value is positive inside, so the surface is [`super::march()`] at 0;
 //! corners that were seen too little stay unknown and the surface stays open there.
 
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -116,7 +116,7 @@ impl TsdfVolume {
     /// The surface, in the grid's relative coordinates.
     ///
     /// # Errors
-    /// As [`march`].
+    /// As [`march()`].
     pub fn mesh(&self) -> Result<TriMesh, ExtractError> {
         march(&self.grid, 0.0)
     }
