@@ -144,7 +144,7 @@ mod tests {
                 seconds: 2.0 * n as f64,
                 loss: 0.1,
                 psnr: if n == 3 { f64::NAN } else { 15.0 + n as f64 },
-                test_psnr: (n >= 5).then(|| if n < 10 { 18.5 } else { 19.5 }),
+                test_psnr: (n >= 5).then_some(if n < 10 { 18.5 } else { 19.5 }),
                 rays_per_second: 1.0,
                 samples_per_second: 1.0,
             })

@@ -302,7 +302,7 @@ mod tests {
             ..Geometry::default()
         };
         let picture = rasterise(&[&points], &view, 100, 100);
-        let border = |n: usize| n % 100 == 0 || n % 100 == 99 || n < 100 || n >= 9900;
+        let border = |n: usize| n.is_multiple_of(100) || n % 100 == 99 || !(100..9900).contains(&n);
         let drawn: Vec<usize> = (0..10_000).filter(|n| picture.rgba[*n][3] > 0).collect();
         assert!(drawn.len() > 150 && !drawn.iter().any(|n| border(*n)));
         let rows =

@@ -73,7 +73,7 @@ impl TableState {
     #[inline(always)]
     pub fn update(&mut self, table: &mut [Row], step: StepSize) {
         let [w, g, m, v] = [table, &mut self.grad, &mut self.first, &mut self.second]
-            .map(|rows| bytemuck::cast_slice_mut::<Row, f32>(rows));
+            .map(bytemuck::cast_slice_mut::<Row, f32>);
         for (((w, g), m), v) in w.iter_mut().zip(g).zip(m).zip(v) {
             let (m1, v1) = (*m + (1.0 - BETA1) * (*g - *m), *v + (1.0 - BETA2) * (*g * *g - *v));
             let w1 = *w - step.rate * m1 / ((v1 * step.correction).sqrt() + EPSILON);

@@ -11,7 +11,7 @@ use crate::scene::SceneError;
 pub enum TrainError {
     /// A frame cannot be read.
     #[error(transparent)]
-    Scene(#[from] SceneError),
+    Scene(Box<SceneError>),
     /// A setting cannot be used.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -51,4 +51,11 @@ pub enum TrainError {
     /// A file cannot be written.
     #[error(transparent)]
     Write(#[from] divff_exporters::Error),
+}
+
+// Boxed: a scene error is large, and every result here would carry its size.
+impl From<SceneError> for TrainError {
+    fn from(error: SceneError) -> Self {
+        Self::Scene(Box::new(error))
+    }
 }
