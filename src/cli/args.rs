@@ -174,7 +174,7 @@ pub struct ExportArgs {
     #[arg(long, default_value = "auto", value_parser = Times::from_str)]
     pub times: Times,
     /// Side of a voxel, world units [default: 1/350 of the diagonal of the scene's box]
-    #[arg(long, value_name = "LENGTH")]
+    #[arg(long, value_name = "LENGTH", allow_negative_numbers = true)]
     pub voxel: Option<f64>,
     /// Where the scene is, if it was moved
     #[arg(long, value_name = "SCENE")]

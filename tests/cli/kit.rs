@@ -4,11 +4,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
-/// Settings under which a run takes a second or two.
+/// Settings under which a run takes a few seconds.
 pub const TINY: &str = "
 [train]
-steps = 100
-rays = 256
+steps = 400
+rays = 1024
+# Long enough that the small fields of what moves do not explain what stays.
+static_until = 0.6
 samples = 12
 render_samples = 16
 grid_cells = 32.0

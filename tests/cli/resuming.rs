@@ -12,19 +12,18 @@ use divff::scene::Scene;
 
 use crate::kit::{TINY, arg, assert_same_files, divff, files, folder, run, scene, tiny};
 
-/// Stops training at its first report.
-#[derive(Default)]
+/// Stops training after some reports.
 struct Impatient {
-    reports: usize,
+    patience: usize,
 }
 
 impl Observer for Impatient {
     fn event(&mut self, event: &Event) {
-        self.reports += usize::from(matches!(event, Event::Training(_)));
+        self.patience -= usize::from(matches!(event, Event::Training(_)));
     }
 
     fn stop(&self) -> bool {
-        self.reports > 0
+        self.patience == 0
     }
 }
 
@@ -34,16 +33,20 @@ fn a_stopped_run_that_goes_on_gives_the_bytes_of_an_uninterrupted_one() {
     let scene = Scene::open(scene()).unwrap();
     let config = Config::default().overlaid(TINY, "TINY").unwrap();
     let stopped = RunFolder::new(&out);
-    let trained = pipeline::train(&scene, &config, &stopped, false, &mut Impatient::default()).unwrap();
-    assert_eq!((trained.progress.step, trained.progress.finished), (50, false));
+    // Once while what stays is trained alone, and once when all streams are.
+    for (patience, step) in [(1, 50), (5, 300)] {
+        let observer = &mut Impatient { patience };
+        let trained = pipeline::train(&scene, &config, &stopped, false, observer).unwrap();
+        assert_eq!((trained.progress.step, trained.progress.finished), (step, false));
+    }
     let trained = pipeline::train(&scene, &config, &stopped, false, &mut ()).unwrap();
-    assert_eq!((trained.progress.step, trained.progress.finished), (100, true));
+    assert_eq!((trained.progress.step, trained.progress.finished), (400, true));
     let cost = &mut Cost::default();
     let map = stopped.map();
     pipeline::export_map(&scene, &trained, &config, &map, &Format::ALL, cost, &mut ()).unwrap().unwrap();
     assert_same_files(&map, &run().join("map"));
     let log = fs::read_to_string(stopped.log_path()).unwrap();
-    assert_eq!(log.lines().count(), 2, "{log}");
+    assert_eq!(log.lines().count(), 8, "{log}");
 }
 
 #[cfg(unix)]
@@ -74,9 +77,9 @@ fn ctrl_c_stops_with_a_checkpoint_and_the_same_command_goes_on() {
     let said = divff(&["inspect", arg(&out)]).ok();
     assert!(said.contains("not finished"), "{said}");
     divff(&["train", arg(scene()), "--out", arg(&out), "--config", arg(tiny())])
-        .fails(2, &["train.steps is 1000000 there and 100 now", "--fresh"]);
+        .fails(2, &["train.steps is 1000000 there and 400 now", "--fresh"]);
     divff(&["train", arg(scene()), "--out", arg(&out), "--config", arg(tiny()), "--fresh"]).ok();
-    assert_eq!(log_lines(&out), 2, "what was there is gone");
+    assert_eq!(log_lines(&out), 8, "what was there is gone");
 }
 
 #[test]
