@@ -3,6 +3,7 @@
 use std::io::Cursor;
 
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::error::{ParameterError, ParameterErrorKind};
 use image::{ExtendedColorType, ImageEncoder, ImageError};
 
 /// A picture as the address of an `<img>`; `pixels` are `[height * width]` of 3 (RGB) or 4 (RGBA) bytes, sRGB.
@@ -14,6 +15,10 @@ pub fn png_address<const N: usize>(
     width: usize,
     height: usize,
 ) -> Result<String, ImageError> {
+    // The encoder itself panics on a buffer of another length.
+    if pixels.len() != width * height {
+        return Err(ImageError::Parameter(ParameterError::from_kind(ParameterErrorKind::DimensionMismatch)));
+    }
     let kind = if N == 4 { ExtendedColorType::Rgba8 } else { ExtendedColorType::Rgb8 };
     let mut png = Cursor::new(Vec::new());
     PngEncoder::new_with_quality(&mut png, CompressionType::Default, FilterType::Adaptive).write_image(

@@ -43,8 +43,8 @@ impl Viewpoint {
     /// centre.
     pub fn around(centre: DVec3, radius: f64, from: DVec3, up: Vec3) -> Self {
         let focal = 1.4f32;
-        // Half the picture is 0.5 high at distance `focal`; the sphere must touch no edge.
-        let half_angle = (0.5 / f64::from(focal)).atan();
+        // Half the picture is 0.5 high at distance `focal`; a margin of 2 % keeps the sphere off the edges.
+        let half_angle = (0.48 / f64::from(focal)).atan();
         let eye = centre + from.normalize_or(DVec3::Z) * radius / half_angle.sin();
         Self::looking_at(eye, centre, up, focal)
     }
