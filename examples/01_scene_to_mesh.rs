@@ -4,7 +4,7 @@
 //! cargo run --release --example 01_scene_to_mesh -- SCENE OUT
 //! ```
 //!
-//! Without arguments it makes a tiny synthetic kitchen first and trains on it for some seconds.
+//! Without arguments it makes a tiny synthetic kitchen first and trains on it for half a minute.
 
 use std::error::Error;
 use std::ops::ControlFlow;
@@ -24,7 +24,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     let folder = std::env::temp_dir().join(format!("divff-example-{}", std::process::id()));
     let scene = folder.join("scene");
     generate(&SynthOptions { frames: 24, width: 96, height: 54, seed: 0 }, &scene)?;
-    let quick = "train = { steps = 200, rays = 1024 }\nmap = { points = 10000, depth_rays = 200000 }";
+    let quick = "
+        train = { steps = 300, rays = 2048, streams = 'static' }
+        field.persistent.log2_rows = 14
+        map = { points = 10000, depth_rays = 200000 }";
     scene_to_mesh(&scene, &folder, Config::default().overlaid(quick, "the example's settings")?)
 }
 
