@@ -6,6 +6,7 @@ use std::path::Path;
 use divff::config::{Config, Preset};
 use divff::pipeline::{self, Outcome, RunFolder, RunOptions};
 use divff::synth::{SynthOptions, SynthSummary, generate};
+use divff::train::StreamChoice;
 
 use super::args::{DemoArgs, SynthArgs};
 use super::error::CliError;
@@ -13,6 +14,9 @@ use super::output::say;
 use super::progress::Reporter;
 use super::run::{open, summary};
 use super::stop::StopFlag;
+
+/// Frames of the demo's video: enough for every place to be seen from several sides.
+const DEMO_FRAMES: u32 = 200;
 
 /// `divff synth`.
 pub fn synth(args: &SynthArgs) -> Result<(), CliError> {
@@ -25,7 +29,7 @@ pub fn synth(args: &SynthArgs) -> Result<(), CliError> {
 /// `divff demo`.
 pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
     let (scene_path, run_path) = (args.out.join("scene"), args.out.join("run"));
-    let options = SynthOptions { seed: args.seed, ..SynthOptions::default() };
+    let options = SynthOptions { frames: DEMO_FRAMES, seed: args.seed, ..SynthOptions::default() };
     let mut reporter = Reporter::new(stop);
     // A demo that was stopped goes on: its scene is complete as soon as it has its list of frames.
     if scene_path.join("transforms.json").is_file() {
@@ -38,6 +42,8 @@ pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
     let scene = open(&scene_path, &reporter)?;
     let mut config = Config::preset(Preset::Draft);
     config.seed = args.seed;
+    // The short budget is too short to find out that something moves; here it is known.
+    config.train.streams = StreamChoice::All;
     config.time_budget_s = Some(args.time_budget.as_secs_f64());
     let outcome = pipeline::run(&scene, &config, &run_path, &RunOptions::default(), &mut reporter)?;
     drop(reporter);
