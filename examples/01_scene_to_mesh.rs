@@ -4,7 +4,7 @@
 //! cargo run --release --example 01_scene_to_mesh -- SCENE OUT
 //! ```
 //!
-//! Without arguments it makes a tiny synthetic kitchen first and trains on it for half a minute.
+//! Without arguments it makes a tiny synthetic kitchen first and trains on it for a minute or two.
 
 use std::error::Error;
 use std::ops::ControlFlow;
