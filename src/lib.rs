@@ -17,5 +17,6 @@ pub mod report;
 mod rng;
 pub mod scene;
 mod simd;
+pub mod stereo;
 pub mod synth;
 pub mod train;

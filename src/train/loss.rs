@@ -6,6 +6,12 @@ use crate::field::stream::StreamSamples;
 use crate::render::composite::{Interval, Weighted};
 use crate::render::forward::Chunk;
 
+/// Relative error of stereo depth that costs nothing.
+const STEREO_ERROR: f32 = 0.01;
+
+/// Relative error of depth from which on a ray's end is simply elsewhere.
+const FAR_OFF: f32 = 0.08;
+
 /// Weights of the loss's terms.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -20,6 +26,8 @@ pub struct LossConfig {
     pub distortion: f32,
     /// Softness Σ_k T_k α_k (1 − α_k) of a ray: surfaces are hard, air is empty.
     pub entropy: f32,
+    /// Price of stopping light where stereo says that a ray passes or that it has already ended.
+    pub depth: f32,
     /// Price of per-frame exposure away from none: times half the squares of its six numbers.
     pub exposure: f32,
 }
@@ -32,6 +40,7 @@ impl Default for LossConfig {
             transient_opacity: [8.0, 6.0],
             distortion: 0.3,
             entropy: 0.0,
+            depth: 4.0,
             exposure: 0.1,
         }
     }
@@ -68,6 +77,8 @@ pub struct RayTarget {
     pub background: [f32; 3],
     /// log gain and offset of the three channels.
     pub exposure: [f32; 6],
+    /// Distance along the ray at which it ends according to stereo, units; 0 where that is not known.
+    pub depth: f32,
 }
 
 /// Evaluates the loss of a traced chunk and fills `grad`. `scale` multiplies the whole gradient (1 / rays).
@@ -140,6 +151,15 @@ pub fn backward(
                     &mut grad.weight[range.clone()],
                 );
         }
+        if target.depth > 0.0 {
+            for k in range.clone() {
+                let price = config.depth * wrong_depth(chunk.intervals[k].t, target.depth);
+                extra += price * chunk.weighted[k].total();
+                for g in &mut grad.weight[k] {
+                    *g += scale * price;
+                }
+            }
+        }
         if config.entropy > 0.0 {
             // Σ_k T α (1 − α) = Σ_k w (1 − α), w the weight of all streams: here its gradient by w.
             for (w, g) in chunk.weighted[range.clone()].iter().zip(&mut grad.weight[range.clone()]) {
@@ -176,6 +196,12 @@ pub fn backward(
         loss.total += f64::from(extra);
     }
     loss
+}
+
+/// How wrong it is for a ray to end at `t` where stereo says `depth`, 0 to 1: nothing within its error, and no more
+/// beyond [`FAR_OFF`], so that a false match costs a bounded price.
+fn wrong_depth(t: f32, depth: f32) -> f32 {
+    (((t - depth).abs() / depth - STEREO_ERROR) / (FAR_OFF - STEREO_ERROR)).clamp(0.0, 1.0)
 }
 
 /// Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i; adds its gradient with respect to the weights times `scale`, in O(n).

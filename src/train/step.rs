@@ -373,6 +373,7 @@ impl Group {
                 rgb: pixels.images[frame][pixel].map(|c| f32::from(c) / 255.0),
                 background: [rng.uniform(), rng.uniform(), rng.uniform()],
                 exposure,
+                depth: pixels.stereo_distance(frame, pixel),
             });
         }
     }
