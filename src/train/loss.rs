@@ -71,6 +71,7 @@ pub struct RayTarget {
 }
 
 /// Evaluates the loss of a traced chunk and fills `grad`. `scale` multiplies the whole gradient (1 / rays).
+#[inline(always)]
 pub fn backward(
     config: &LossConfig,
     chunk: &Chunk,
@@ -179,6 +180,7 @@ pub fn backward(
 }
 
 /// Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i; adds its gradient with respect to the weights times `scale`, in O(n).
+#[inline(always)]
 fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &mut [[f32; 3]]) -> f32 {
     let (mut all, mut all_t) = (0.0, 0.0);
     for (i, w) in intervals.iter().zip(weighted) {
