@@ -3,7 +3,7 @@
 //! ```text
 //! scene → field → render → train → extract → map → files
 //! ```
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 mod bvh;
 pub mod config;
@@ -16,7 +16,7 @@ pub mod render;
 pub mod report;
 mod rng;
 pub mod scene;
-mod simd;
+pub mod simd;
 pub mod stereo;
 pub mod synth;
 pub mod train;

@@ -89,6 +89,15 @@ pub struct StereoDepth {
 }
 
 impl StereoDepth {
+    /// The same depth at every pixel of a pinhole.
+    #[cfg(test)]
+    pub(crate) fn flat(camera: &Camera, depth: f32) -> Self {
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        let focal = Vec2::new(camera.fx as f32, camera.fy as f32);
+        let principal = Vec2::new(camera.cx as f32, camera.cy as f32);
+        Self { width, height, focal, principal, depth: vec![depth; width * height] }
+    }
+
     /// Depth along the camera's axis in the direction `dir` (camera axes); `None` where it is not known.
     pub fn at(&self, dir: Vec3) -> Option<f32> {
         let p = dir.truncate() / dir.z * self.focal + self.principal;

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::field::mlp::Precision;
+
 /// Which streams are trained.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -61,6 +63,8 @@ pub struct TrainConfig {
     pub skip_from: f64,
     /// Share of a ray's samples spread evenly at the start, and at the end of the schedule.
     pub explore: [f32; 2],
+    /// What the networks are multiplied in while training.
+    pub precision: Precision,
     /// Seconds between checkpoints.
     pub checkpoint_seconds: f64,
 }
@@ -89,6 +93,7 @@ impl Default for TrainConfig {
             sharpness: 0.3,
             skip_from: 0.1,
             explore: [0.5, 0.1],
+            precision: Precision::Auto,
             checkpoint_seconds: 60.0,
         }
     }

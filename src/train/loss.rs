@@ -7,10 +7,10 @@ use crate::render::composite::{Interval, Weighted};
 use crate::render::forward::Chunk;
 
 /// Relative error of stereo depth that costs nothing.
-const STEREO_ERROR: f32 = 0.01;
+pub(super) const STEREO_ERROR: f32 = 0.01;
 
 /// Relative error of depth from which on a ray's end is simply elsewhere.
-const FAR_OFF: f32 = 0.08;
+pub(super) const FAR_OFF: f32 = 0.08;
 
 /// Weights of the loss's terms.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -82,6 +82,7 @@ pub struct RayTarget {
 }
 
 /// Evaluates the loss of a traced chunk and fills `grad`. `scale` multiplies the whole gradient (1 / rays).
+#[inline(always)]
 pub fn backward(
     config: &LossConfig,
     chunk: &Chunk,
@@ -205,6 +206,7 @@ fn wrong_depth(t: f32, depth: f32) -> f32 {
 }
 
 /// Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i; adds its gradient with respect to the weights times `scale`, in O(n).
+#[inline(always)]
 fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &mut [[f32; 3]]) -> f32 {
     let (mut all, mut all_t) = (0.0, 0.0);
     for (i, w) in intervals.iter().zip(weighted) {

@@ -13,7 +13,7 @@ use crate::field::stream::BETA_MAX;
 use crate::field::{Field, VIEW};
 use crate::render::forward::{Chunk, RayInput};
 use crate::render::rays::View;
-use crate::train::loss::{LossConfig, RayTarget};
+use crate::train::loss::{FAR_OFF, LossConfig, RayTarget, STEREO_ERROR};
 
 /// Everything that is learned, in f64.
 #[derive(Clone)]
@@ -91,6 +91,12 @@ impl Reference<'_> {
                     transient += sample.sigma * delta;
                     price += f64::from(c.transient_opacity[s - 1]) * w;
                 }
+            }
+            let (t, depth) = (f64::from(i.t), f64::from(self.targets[r].depth));
+            if depth > 0.0 {
+                let [free, whole] = [STEREO_ERROR, FAR_OFF].map(f64::from);
+                let wrong = (((t - depth).abs() / depth - free) / (whole - free)).clamp(0.0, 1.0);
+                price += f64::from(c.depth) * wrong * total;
             }
             entropy += light * alpha * (1.0 - alpha);
             weights.push((total, f64::from(i.t), delta));
