@@ -151,7 +151,7 @@ fn tables(c: &mut Criterion) {
     let mut points = vec![[[0.0; TILE]; 3]; POINTS.div_ceil(TILE)];
     for (n, tile) in points.iter_mut().enumerate() {
         for lane in 0..TILE {
-            if (n * TILE + lane) % 16 == 0 {
+            if (n * TILE + lane).is_multiple_of(16) {
                 at = Vec3::new(numbers.next(), numbers.next(), numbers.next());
             }
             for axis in 0..3 {

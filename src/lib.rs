@@ -1,7 +1,7 @@
 //! Semantic 3D maps from egocentric video, on a plain CPU.
 //!
 //! ```text
-//! scene → field → render → train → extract → map → files
+//! scene → field → render → train → extract → semantics → map → files
 //! ```
 #![deny(unsafe_code)]
 
@@ -16,6 +16,7 @@ pub mod render;
 pub mod report;
 mod rng;
 pub mod scene;
+pub mod semantics;
 pub mod simd;
 pub mod stereo;
 pub mod synth;

@@ -16,6 +16,7 @@ pub mod exr;
 pub mod geometry;
 pub mod glb;
 pub mod manifest;
+pub mod npy;
 pub mod npz;
 pub mod ply;
 #[cfg(test)]
@@ -28,5 +29,6 @@ pub use exr::{ExrChannel, ExrImage, ExrSamples, read_exr, write_exr};
 pub use geometry::{Attribute, AttributeValues, Features, Geometry};
 pub use glb::{GlbContents, GlbNode, GlbOptions, GlbScene, Interval, read_glb, write_glb, write_scene_glb};
 pub use manifest::Manifest;
+pub use npy::{NpyArray, NpyHeader, read_npy, read_npy_header, write_npy};
 pub use npz::{NpzCompression, read_npz, write_npz};
 pub use ply::{PlyOptions, read_ply, write_ply};

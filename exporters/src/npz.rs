@@ -4,7 +4,6 @@
 //! feature (N,dim) f32, and `triangles` (M,3) i32 of meshes. Name and offset are a JSON object in the zip's
 //! comment, where neither numpy nor Open3D stumbles over them.
 
-mod npy;
 mod read;
 mod write;
 

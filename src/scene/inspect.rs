@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 use serde::Serialize;
 
+use super::features::{FeatureKind, FeatureStore, FeatureSummary};
 use super::{Frame, Scene, Split, bounds};
 
 /// Optional folders of a scene, and whether their files are named after frames.
@@ -59,6 +60,8 @@ pub struct Inspection {
     pub masks: usize,
     /// The optional folders that are there.
     pub folders: Vec<FolderCount>,
+    /// The kinds of features that are there, how many frames have each, and their size.
+    pub features: Vec<FeatureKind>,
     /// Whether every image, depth and mask was decoded.
     pub deep: bool,
     /// What is suspicious but does not stop anything.
@@ -89,7 +92,7 @@ pub struct FolderCount {
     pub frames: Option<usize>,
 }
 
-/// Looks a scene over. `deep` also decodes every image, depth and mask.
+/// Looks a scene over. `deep` also decodes every image, depth and mask and reads every feature file to its end.
 pub fn inspect(scene: &Scene, deep: bool) -> Inspection {
     let mut warnings = scene.warnings.clone();
     let count = |has: fn(&Frame) -> bool| scene.frames.iter().filter(|f| has(f)).count();
@@ -102,6 +105,13 @@ pub fn inspect(scene: &Scene, deep: bool) -> Inspection {
     suspect_poses(scene, &steps, baseline, &mut warnings);
     suspect_times(scene, &mut warnings);
     let folders = count_folders(scene, &mut warnings);
+    let features = match FeatureStore::open(scene) {
+        Ok(store) => store.summary(&scene.frames, deep),
+        Err(error) => FeatureSummary { problems: vec![error.to_string()], ..FeatureSummary::default() },
+    };
+    warnings.extend(features.warnings);
+    let mut problems = find_problems(scene, deep);
+    problems.extend(features.problems);
     let indices = || scene.frames.iter().map(|f| f.frame_index);
     Inspection {
         root: scene.root.clone(),
@@ -121,9 +131,10 @@ pub fn inspect(scene: &Scene, deep: bool) -> Inspection {
         depth_is_ground_truth: scene.depth_is_ground_truth,
         masks: count(|f| f.mask_path.is_some()),
         folders,
+        features: features.kinds,
         deep,
         warnings,
-        problems: find_problems(scene, deep),
+        problems,
     }
 }
 
@@ -270,6 +281,9 @@ impl fmt::Display for Inspection {
                 Some(frames) => writeln!(f, " for {frames} frames")?,
                 None => writeln!(f)?,
             }
+        }
+        for kind in &self.features {
+            writeln!(f, "features   {kind}")?;
         }
         write_list(f, "warning", &self.warnings)?;
         write_list(f, "problem", &self.problems)?;

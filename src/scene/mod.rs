@@ -10,6 +10,7 @@ mod draft;
 mod epic_diff;
 mod epic_fields;
 mod error;
+pub mod features;
 mod header;
 mod image;
 mod inspect;

@@ -55,6 +55,12 @@ pub fn available() -> bool {
     false
 }
 
+impl Default for Unit {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 impl Unit {
     /// The matrix units where there are any, configured for this thread.
     pub fn new() -> Self {
@@ -257,7 +263,7 @@ mod tests {
     fn rounding_is_to_nearest_even() {
         let mut rng = Rng::new(3, 0, 0);
         for n in 0..100_000u32 {
-            let x = f32::from_bits(((rng.uniform() * 65536.0) as u32) << 16 | n % 65536);
+            let x = f32::from_bits((((rng.uniform() * 65536.0) as u32) << 16) | (n % 65536));
             if !x.is_nan() {
                 assert_eq!(narrow(x), half::bf16::from_f32(x).to_bits(), "{x:e}");
             }

@@ -320,7 +320,7 @@ fn solve(matrix: &[[f64; UNKNOWNS]; UNKNOWNS], right: [f64; UNKNOWNS]) -> Option
         for j in 0..=i {
             let sum = matrix[i][j] - (0..j).map(|k| l[i][k] * l[j][k]).sum::<f64>();
             if i == j {
-                if !(sum > 0.0) {
+                if sum.is_nan() || sum <= 0.0 {
                     return None;
                 }
                 l[i][i] = sum.sqrt();

@@ -8,9 +8,9 @@ use serde_json::Value;
 use zip::ZipArchive;
 use zip::result::ZipError;
 
-use super::npy::{self, Array, Dtype};
 use crate::error::{Error, Result};
 use crate::geometry::{Attribute, AttributeValues, Features, Geometry};
+use crate::npy::{self, Dtype};
 
 /// Deflate cannot expand by more than about this factor, so no honest entry claims more.
 const MAX_DEFLATE_RATIO: u64 = 1032;
@@ -30,7 +30,7 @@ pub fn read_npz(path: &Path) -> Result<Geometry> {
     read_note(path, archive.comment(), &mut geometry)?;
     for index in 0..archive.len() {
         let (name, content) = read_entry(path, &mut archive, index, file_bytes)?;
-        let array = npy::parse(path, &name, &content)?;
+        let array = parse_array(path, &name, &content)?;
         insert(path, &mut geometry, name, &array)?;
     }
     geometry.validate().map_err(|error| match error {
@@ -82,6 +82,36 @@ fn read_entry(
         return Err(Error::invalid(path, format!("array `{name}` has {} bytes, not {size}", content.len())));
     }
     Ok((name, content))
+}
+
+/// An array as stored; one dimension counts as one column.
+pub(super) struct Array<'a> {
+    pub(super) dtype: Dtype,
+    pub(super) columns: usize,
+    pub(super) bytes: &'a [u8],
+}
+
+/// An array of one or two dimensions and of the types that geometry has.
+///
+/// # Errors
+/// `Invalid` for contradictions, `Unsupported` for other types and dimensions.
+pub(super) fn parse_array<'a>(path: &Path, name: &str, file: &'a [u8]) -> Result<Array<'a>> {
+    let (header, _) = npy::parse_header(path, name, file)?;
+    let unsupported = |what: String| Error::Unsupported {
+        path: path.to_owned(),
+        what: format!("array `{name}`: {what}"),
+        remedy: "save C-ordered <f4, <i4 or |u1 arrays of one or two dimensions",
+    };
+    if !matches!(header.dtype, Dtype::F32 | Dtype::I32 | Dtype::U8) {
+        return Err(unsupported(format!("its type {}", header.dtype.descr())));
+    }
+    let columns = match header.shape[..] {
+        [_] => 1,
+        [_, columns] => columns,
+        _ => return Err(unsupported("not one or two dimensions".into())),
+    };
+    let (_, bytes) = npy::parse(path, name, file)?;
+    Ok(Array { dtype: header.dtype, columns, bytes })
 }
 
 fn insert(path: &Path, geometry: &mut Geometry, name: String, array: &Array) -> Result<()> {

@@ -6,10 +6,10 @@ use std::path::Path;
 use serde_json::json;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
-use super::npy::{self, Dtype};
 use crate::atomic::{AtomicWriter, write_atomically};
 use crate::error::Result;
 use crate::geometry::{AttributeValues, Geometry};
+use crate::npy::{self, Dtype};
 
 /// How the arrays are stored.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -91,7 +91,7 @@ impl Archive<'_> {
         values: &[T],
         bytes: impl Fn(&T) -> [u8; N],
     ) -> io::Result<()> {
-        let header = npy::header(dtype, values.len() / columns, columns);
+        let header = npy::header_bytes(dtype, &[values.len() / columns, columns]);
         let total = (header.len() + values.len() * N) as u64;
         let method = match self.compression {
             NpzCompression::Stored => zip::CompressionMethod::Stored,

@@ -280,10 +280,12 @@ fn inspection_counts_what_is_there_and_names_what_is_wrong() {
     assert_eq!(report.folders[0].frames, Some(1));
     assert_eq!(report.folders[0].files, 4);
     assert_eq!(report.folders[1].name, "text");
-    assert_eq!(report.problems.len(), 1);
+    assert_eq!(report.problems.len(), 3, "{report}");
     assert!(report.problems[0].contains("frame_000003"), "{report}");
+    assert!(report.problems[1].contains("frame_000001_f.npy"), "{report}");
+    assert!(report.problems[2].contains("clip.npy"), "{report}");
     assert!(report.warnings.iter().any(|w| w.contains("first: frame_000006")), "{report}");
     assert!(report.warnings.iter().any(|w| w.starts_with("1 files in language_features")), "{report}");
-    assert_eq!(inspect(&scene, false).problems, Vec::<String>::new());
+    assert_eq!(inspect(&scene, false).problems.len(), 3, "headers alone, for features; the images look fine");
     assert!(serde_json::to_string(&report).unwrap().contains("\"frames\":9"));
 }

@@ -87,3 +87,25 @@ fn shipped_scenes_have_no_problems() {
         println!("{report}");
     }
 }
+
+#[test]
+fn the_features_of_kitchen_a_are_read_without_a_complaint() {
+    let Some(folder) = data("kitchen-a") else { return };
+    let scene = Scene::open(&folder).unwrap();
+    let inspection = inspect(&scene, true);
+    assert!(inspection.problems.is_empty(), "{:?}", inspection.problems);
+    let feature = |name: &str| {
+        let kind = inspection.features.iter().find(|k| k.name == name);
+        kind.map(|k| (k.count, k.dim))
+    };
+    for (name, expected) in [
+        ("image masks", (90, Some(512))),
+        ("image patches 0", (20, Some(512))),
+        ("video clips", (240, Some(512))),
+        ("part features", (20, Some(64))),
+        ("text, clip", (184, Some(512))),
+        ("text, egovideo", (29, Some(512))),
+    ] {
+        assert_eq!(feature(name), Some(expected), "{name}");
+    }
+}

@@ -1,0 +1,236 @@
+//! Products of many points with a few phrases, and the scores that follow.
+//!
+//! Lanes are phrases: a point's numbers are broadcast one after the other and multiplied with the phrases' numbers of
+//! that dimension. So points stay as they are stored, and there is no sum across lanes but the point's own length.
+
+use half::f16;
+use half::slice::HalfFloatSliceExt;
+use pulp::{Arch, Simd, WithSimd};
+
+use super::{Points, Queries};
+use crate::simd;
+
+/// Points together: as many independent sums hide the latency of a multiply-add on two ports.
+const TOGETHER: usize = 8;
+/// Points whose products are kept before they become scores.
+const BLOCK: usize = 64;
+/// Products per point are padded to this: one AVX-512 vector.
+const PADDING: usize = 16;
+
+/// Below this share of its summands, a squared length in f32 has lost digits; the point is computed again in f64.
+const CANCELLED: f32 = 0.05;
+/// Below this share, it is rounding in f64 of numbers that were stored as f32: the feature has vanished.
+const VANISHED: f64 = 1e-12;
+
+/// Phrases in the order in which the kernel reads them.
+pub(super) struct Packed {
+    /// `[dim, stride]`: of each dimension, the numbers of all phrases, then that of the norm's linear part.
+    columns: Vec<f32>,
+    /// `[stride]`: what products start from.
+    offsets: Vec<f32>,
+    dim: usize,
+    stride: usize,
+    /// Columns that are in use.
+    used: usize,
+}
+
+impl Packed {
+    pub(super) fn new(queries: &Queries) -> Self {
+        let dim = queries.norm.linear.len();
+        let used = queries.phrases.len() + 1;
+        let stride = used.next_multiple_of(PADDING);
+        let (mut columns, mut offsets) = (vec![0.0; dim * stride], vec![0.0; stride]);
+        for (n, phrase) in queries.phrases.iter().enumerate() {
+            offsets[n] = phrase.offset;
+            for (k, v) in phrase.direction.iter().enumerate() {
+                columns[k * stride + n] = *v;
+            }
+        }
+        for (k, v) in queries.norm.linear.iter().enumerate() {
+            columns[k * stride + used - 1] = 2.0 * v;
+        }
+        offsets[used - 1] = queries.norm.constant;
+        Self { columns, offsets, dim, stride, used }
+    }
+}
+
+/// Scores of the points of a chunk; returns the first point that is not finite, whose score is then undefined.
+pub(super) fn run(
+    queries: &Queries,
+    packed: &Packed,
+    points: Points,
+    scores: &mut [&mut [f32]],
+    coverage: &mut [f32],
+) -> Option<usize> {
+    Arch::new().dispatch(Run { queries, packed, points, scores, coverage })
+}
+
+/// Copies points as f32.
+pub(super) fn widen(points: Points, out: &mut [f32]) {
+    match points {
+        Points::F32(values) => out.copy_from_slice(values),
+        Points::F16(values) => values.convert_to_f32_slice(out),
+    }
+}
+
+struct Run<'a, 'b> {
+    queries: &'a Queries,
+    packed: &'a Packed,
+    points: Points<'a>,
+    scores: &'a mut [&'b mut [f32]],
+    coverage: &'a mut [f32],
+}
+
+impl WithSimd for Run<'_, '_> {
+    type Output = Option<usize>;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Option<usize> {
+        let Run { queries, packed, points, scores, coverage } = self;
+        let (dim, stride) = (packed.dim, packed.stride);
+        let mut wide = Vec::new();
+        let mut products = vec![0.0; BLOCK * stride];
+        let mut squares = [0.0; BLOCK];
+        let mut first_bad = None;
+        for start in (0..coverage.len()).step_by(BLOCK) {
+            let count = BLOCK.min(coverage.len() - start);
+            let rows: &[f32] = match points {
+                Points::F32(values) if count == BLOCK => &values[start * dim..(start + BLOCK) * dim],
+                // Half precision, or a block that is not full: the kernel wants whole groups of f32.
+                part => {
+                    wide.resize(BLOCK * dim, 0.0);
+                    widen(part_of(part, start * dim, (start + count) * dim), &mut wide[..count * dim]);
+                    wide[count * dim..].fill(0.0);
+                    &wide
+                }
+            };
+            for (n, rows) in rows.chunks_exact(TOGETHER * dim).enumerate() {
+                let out = &mut products[n * TOGETHER * stride..][..TOGETHER * stride];
+                multiply(simd, packed, rows, out);
+            }
+            for (square, row) in squares.iter_mut().zip(rows.chunks_exact(dim)) {
+                *square = squared(simd, row);
+            }
+            for n in 0..count {
+                let (at, row) = (start + n, &rows[n * dim..][..dim]);
+                let products = &products[n * stride..][..packed.used];
+                coverage[at] = 1.0;
+                // Margins for now; scores are made of them below, in a loop that vectorises.
+                if let Some((nearest, scale)) = judge(queries, products, squares[n]) {
+                    for (scores, product) in scores.iter_mut().zip(products) {
+                        scores[at] = (product - nearest) * scale;
+                    }
+                    continue;
+                }
+                match judge_in_f64(queries, row) {
+                    Rare::Margins(margins) => {
+                        scores.iter_mut().zip(margins).for_each(|(scores, margin)| scores[at] = margin);
+                    }
+                    Rare::Nothing => coverage[at] = 0.0,
+                    Rare::NonFinite => first_bad = first_bad.or(Some(at)),
+                }
+            }
+            for scores in scores.iter_mut() {
+                let covered = &coverage[start..start + count];
+                for (score, covered) in scores[start..start + count].iter_mut().zip(covered) {
+                    *score = covered * simd::sigmoid(*score);
+                }
+            }
+        }
+        first_bad
+    }
+}
+
+fn part_of(points: Points<'_>, start: usize, end: usize) -> Points<'_> {
+    match points {
+        Points::F32(values) => Points::F32(&values[start..end]),
+        Points::F16(values) => Points::F16(&values[start..end] as &[f16]),
+    }
+}
+
+/// Products of eight points `[8, dim]` with all columns, to `out` `[8, stride]`.
+#[inline(always)]
+fn multiply<S: Simd>(simd: S, packed: &Packed, rows: &[f32], out: &mut [f32]) {
+    let (dim, stride) = (packed.dim, packed.stride);
+    let vectors = stride / S::F32_LANES;
+    let used = packed.used.div_ceil(S::F32_LANES);
+    let columns = S::as_simd_f32s(&packed.columns).0;
+    let offsets = S::as_simd_f32s(&packed.offsets).0;
+    let out = S::as_mut_simd_f32s(out).0;
+    let rows: [&[f32]; TOGETHER] = std::array::from_fn(|p| &rows[p * dim..(p + 1) * dim]);
+    for v in 0..used {
+        let mut sums = [offsets[v]; TOGETHER];
+        for (k, column) in columns.iter().skip(v).step_by(vectors).enumerate().take(dim) {
+            for p in 0..TOGETHER {
+                sums[p] = simd.mul_add_e_f32s(simd.splat_f32s(rows[p][k]), *column, sums[p]);
+            }
+        }
+        for p in 0..TOGETHER {
+            out[p * vectors + v] = sums[p];
+        }
+    }
+}
+
+/// |z|².
+#[inline(always)]
+fn squared<S: Simd>(simd: S, row: &[f32]) -> f32 {
+    let (vectors, rest) = S::as_simd_f32s(row);
+    let mut sums = [simd.splat_f32s(0.0); 4];
+    let (quads, single) = vectors.as_chunks::<4>();
+    for quad in quads {
+        for i in 0..4 {
+            sums[i] = simd.mul_add_e_f32s(quad[i], quad[i], sums[i]);
+        }
+    }
+    for (i, v) in single.iter().enumerate() {
+        sums[i] = simd.mul_add_e_f32s(*v, *v, sums[i]);
+    }
+    let sum = simd.add_f32s(simd.add_f32s(sums[0], sums[1]), simd.add_f32s(sums[2], sums[3]));
+    let mut total = simd.reduce_sum_f32s(sum);
+    for v in rest {
+        total += v * v;
+    }
+    total
+}
+
+/// What turns a point's products into margins, `(product - nearest) * scale`; `None` where f32 is not enough.
+#[inline(always)]
+fn judge(queries: &Queries, products: &[f32], square: f32) -> Option<(f32, f32)> {
+    let (canonical, norm2) =
+        (&products[queries.wanted..products.len() - 1], products[products.len() - 1] + square);
+    let nearest = canonical.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    // False for NaN and infinities too, and where squares underflow.
+    let sound = norm2 > CANCELLED * (queries.norm.constant + square) && square > 1e-30 && square < 1e30;
+    sound.then(|| (nearest, queries.temperature / norm2.sqrt()))
+}
+
+enum Rare {
+    Margins(Vec<f32>),
+    Nothing,
+    NonFinite,
+}
+
+/// The rare cases: zeros, numbers whose squares leave the range of f32, features that nearly vanish.
+#[cold]
+#[inline(never)]
+fn judge_in_f64(queries: &Queries, row: &[f32]) -> Rare {
+    if row.iter().any(|v| !v.is_finite()) {
+        return Rare::NonFinite;
+    }
+    if row.iter().all(|v| *v == 0.0) {
+        return Rare::Nothing;
+    }
+    let dot = |a: &[f32]| -> f64 { a.iter().zip(row).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum() };
+    let square: f64 = dot(row);
+    let constant = f64::from(queries.norm.constant);
+    let norm2 = constant + 2.0 * dot(&queries.norm.linear) + square;
+    if norm2 <= VANISHED * (constant + square) {
+        return Rare::Nothing;
+    }
+    let products: Vec<f64> =
+        queries.phrases.iter().map(|p| f64::from(p.offset) + dot(&p.direction)).collect();
+    let (wanted, canonical) = products.split_at(queries.wanted);
+    let nearest = canonical.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let scale = f64::from(queries.temperature) / norm2.sqrt();
+    Rare::Margins(wanted.iter().map(|p| ((p - nearest) * scale) as f32).collect())
+}
