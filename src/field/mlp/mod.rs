@@ -1,7 +1,7 @@
 //! Small fully connected networks on tiles of samples, forward and backward.
 //!
 //! A tile's inputs, outputs and their gradients are f32, feature-major `[features][TILE]`. What lies between is the
-//! business of the arithmetic: [`vector`] computes in f32, [`matrix`] multiplies in bf16 and sums in f32. Both keep a
+//! business of the arithmetic: `vector` computes in f32, `matrix` multiplies in bf16 and sums in f32. Both keep a
 //! chunk's activations together, so that the weight gradients are one product over all its samples.
 
 mod matrix;
