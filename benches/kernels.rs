@@ -67,10 +67,19 @@ impl WithSimd for NetworkPass<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { pass, net, packed, activations, gradient } = self;
-        let unit = Unit::new();
+        let unit = Unit::detect();
         match pass {
-            Pass::Forward => (0..TILES).for_each(|n| net.forward(simd, &unit, packed, activations, n)),
-            Pass::Backward => (0..TILES).for_each(|n| net.backward(simd, &unit, packed, activations, n)),
+            // Loops and not closures, which would be compiled without the vector features.
+            Pass::Forward => {
+                for n in 0..TILES {
+                    net.forward(simd, &unit, packed, activations, n);
+                }
+            }
+            Pass::Backward => {
+                for n in 0..TILES {
+                    net.backward(simd, &unit, packed, activations, n);
+                }
+            }
             Pass::WeightGradients => net.accumulate(simd, &unit, packed, activations, TILES, gradient),
         }
     }
@@ -132,10 +141,14 @@ impl WithSimd for TablePass<'_> {
         let Self(level, points, table) = self;
         match table {
             Table::Encode(table, out) => {
-                points.iter().zip(out.chunks_mut(TILE)).for_each(|(p, out)| level.encode(table, p, out));
+                for (p, out) in points.iter().zip(out.chunks_mut(TILE)) {
+                    level.encode(table, p, out);
+                }
             }
             Table::Scatter(table, g) => {
-                points.iter().zip(g.chunks(TILE)).for_each(|(p, g)| level.scatter(table, p, g));
+                for (p, g) in points.iter().zip(g.chunks(TILE)) {
+                    level.scatter(table, p, g);
+                }
             }
             Table::Update(state, table) => state.update(table, StepSize::new(1e-3, 10)),
         }

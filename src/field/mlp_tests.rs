@@ -195,7 +195,7 @@ fn bf16_products_match_f32_ones() {
     for (n, widths) in SHAPES.into_iter().enumerate() {
         let case = Case::new(widths, n as u64);
         let exact = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
-        let rounded = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::new()));
+        let rounded = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::detect()));
         for (a, b) in [
             (&exact.values, &rounded.values),
             (&exact.gradients, &rounded.gradients),
@@ -218,7 +218,7 @@ fn bf16_products_match_f32_ones() {
 fn the_matrix_units_match_plain_loops() {
     for (n, widths) in SHAPES.into_iter().enumerate() {
         let case = Case::new(widths, n as u64);
-        let units = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::new()));
+        let units = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::detect()));
         let plain = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::Portable));
         for (a, b) in [
             (&units.values, &plain.values),

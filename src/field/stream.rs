@@ -240,7 +240,7 @@ impl StreamNet {
         view: impl Fn(usize) -> &'c [f32],
         out: &mut StreamSamples,
     ) {
-        let unit = Unit::new();
+        let unit = Unit::detect();
         let StreamActivations { trunk, head } = activations;
         self.trunk.reserve(w.trunk, batch.pos.len(), trunk);
         self.head.reserve(w.head, batch.pos.len(), head);
@@ -284,7 +284,7 @@ impl StreamNet {
         code: impl Fn(usize) -> &'c [f32],
         out: &mut [f32],
     ) {
-        let unit = Unit::new();
+        let unit = Unit::detect();
         let trunk = &mut activations.trunk;
         self.trunk.reserve(w.trunk, 1, trunk);
         for (n, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
@@ -343,7 +343,7 @@ impl StreamNet {
         mut code: impl FnMut(usize, usize, f32),
         mut position: impl FnMut(usize, usize, Vec3),
     ) {
-        let unit = Unit::new();
+        let unit = Unit::detect();
         let StreamActivations { trunk, head } = activations;
         let StreamBatch { sample, ray, levels, slopes, .. } = batch;
         for (n, (lanes, rays)) in sample.chunks(TILE).zip(ray.chunks(TILE)).enumerate() {

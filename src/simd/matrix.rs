@@ -63,7 +63,7 @@ impl Default for Unit {
 
 impl Unit {
     /// The matrix units where there are any, configured for this thread.
-    pub fn new() -> Self {
+    pub fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
         if let Some(tiles) = Tiles::new() {
             return Self::Tiles(tiles);
@@ -217,7 +217,7 @@ mod tests {
 
     #[test]
     fn the_matrix_units_match_their_twin() {
-        let unit = Unit::new();
+        let unit = Unit::detect();
         if matches!(unit, Unit::Portable) {
             eprintln!("SKIPPED: this CPU has no matrix units");
             return;
@@ -244,7 +244,7 @@ mod tests {
         let mut rng = Rng::new(2, 0, 0);
         let (a, b) = (numbers(&mut rng, 1024), pairs(&mut rng, 32 * PANEL));
         let mut c = vec![0.0; 16 * PANEL];
-        Unit::new().panel(&a, &b, &mut c);
+        Unit::detect().panel(&a, &b, &mut c);
         for row in 0..16 {
             for column in 0..PANEL {
                 let sum: f64 = (0..64)
@@ -279,7 +279,7 @@ mod tests {
         rows[3] = f32::NAN;
         let x: [[u16; PANEL]; 2] = std::array::from_fn(|n| std::array::from_fn(|k| (k % (n + 2)) as u16));
         for keep in [Keep::All, Keep::Positive, Keep::Where([&x[0], &x[1]])] {
-            let outcome = [Unit::new(), Unit::Portable].map(|unit| {
+            let outcome = [Unit::detect(), Unit::Portable].map(|unit| {
                 let (mut pairs, mut low, mut high) = ([1; PANEL], [1; PANEL], [1; PANEL]);
                 let out = Narrowed { pairs: &mut pairs, rows: [&mut low, &mut high] };
                 unit.narrow(&rows, [0.1, -0.2], keep, out);
@@ -295,7 +295,7 @@ mod tests {
     #[test]
     fn transposing_swaps_rows_and_columns() {
         let rows: Vec<u32> = (0..16 * 20).collect();
-        for unit in [Unit::new(), Unit::Portable] {
+        for unit in [Unit::detect(), Unit::Portable] {
             let mut out = [0; 256];
             unit.transpose(&rows, 20, &mut out);
             for (n, v) in out.iter().enumerate() {
