@@ -55,12 +55,6 @@ pub fn available() -> bool {
     false
 }
 
-impl Default for Unit {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
 impl Unit {
     /// The matrix units where there are any, configured for this thread.
     pub fn detect() -> Self {

@@ -194,7 +194,7 @@ impl WithSimd for RunHalf<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Half { net, packed, from, to } = self.half;
-        let (unit, mut tile) = (Unit::new(), Activations::default());
+        let (unit, mut tile) = (Unit::detect(), Activations::default());
         net.reserve(packed, 1, &mut tile);
         for (rows, out) in self.rows.chunks(TILE * from).zip(self.out.chunks_mut(TILE * to)) {
             let input = tile.input(0);
@@ -229,7 +229,7 @@ impl WithSimd for TrainTile<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let (encoder, decoder, full) = (&self.of.encoder, &self.of.decoder, self.of.full);
-        let (unit, [pack_encoder, pack_decoder]) = (Unit::new(), self.packed);
+        let (unit, [pack_encoder, pack_decoder]) = (Unit::detect(), self.packed);
         let (mut code, mut back) = (Activations::default(), Activations::default());
         encoder.reserve(pack_encoder, 1, &mut code);
         decoder.reserve(pack_decoder, 1, &mut back);
