@@ -8,7 +8,7 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_main};
-use divff::field::hashgrid::{HashGrid, Level, Row};
+use divff::field::hashgrid::{AXES, HashGrid, Level, Points, Row};
 use divff::field::mlp::{Activations, Mlp, Packed, Precision};
 use divff::render::composite::{self, Interval, Weighted};
 use divff::render::density_grid::{DensityGrid, STRIDE};
@@ -131,7 +131,7 @@ enum Table<'a> {
     Update(&'a mut TableState, &'a mut [Row]),
 }
 
-struct TablePass<'a>(&'a Level, &'a [[[f32; TILE]; 3]], Table<'a>);
+struct TablePass<'a>(&'a Level, &'a [Points], Table<'a>);
 
 impl WithSimd for TablePass<'_> {
     type Output = ();
@@ -161,7 +161,7 @@ fn tables(c: &mut Criterion) {
     let level = &grid.levels[0];
     // Patches of 16 neighbours, as the rays of a step are.
     let mut at = Vec3::ZERO;
-    let mut points = vec![[[0.0; TILE]; 3]; POINTS.div_ceil(TILE)];
+    let mut points = vec![[[0.0; TILE]; AXES]; POINTS.div_ceil(TILE)];
     for (n, tile) in points.iter_mut().enumerate() {
         for lane in 0..TILE {
             if (n * TILE + lane).is_multiple_of(16) {

@@ -15,10 +15,21 @@ pub const FEATURES: usize = 4;
 /// One table row; a `Vec4` rather than an array because the compiler keeps it in one vector register.
 pub type Row = Vec4;
 
+/// Axes that lattices can span: three of space, and time.
+pub const AXES: usize = 4;
+
+/// The axis of time.
+pub const TIME: usize = 3;
+
+/// Points of one tile, `[axis][lane]`.
+pub type Points = [[f32; TILE]; AXES];
+
 /// The lattice of one level.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Level {
-    /// Cells per unit length.
+    /// The three axes that it spans.
+    pub axes: [usize; 3],
+    /// Cells per unit length along each of them.
     pub scale: Vec3,
     /// Largest cell index along each axis.
     last_cell: [u32; 3],
@@ -53,10 +64,35 @@ impl HashGrid {
         let levels = (0..levels)
             .map(|n| {
                 let scale = coarsest * (finest / coarsest).powf(growth(n));
-                Level::new(extent, scale, 1usize << log2_rows)
+                Level::new([0, 1, 2], extent, scale, 1usize << log2_rows)
             })
             .collect();
         Self { levels }
+    }
+
+    /// Adds `levels` lattices over each of `planes` (two axes of space) and time, from `coarsest` to `finest` cells per
+    /// unit of space and time.
+    ///
+    /// Space alone can only be modulated by a frame's code; here things can move (Cao and Johnson 2023, HexPlane).
+    pub fn with_time(
+        mut self,
+        extent: Vec3,
+        planes: &[[usize; 2]],
+        levels: usize,
+        coarsest: [f32; 2],
+        finest: [f32; 2],
+        log2_rows: u32,
+    ) -> Self {
+        for n in 0..levels {
+            let growth = if levels > 1 { n as f32 / (levels - 1) as f32 } else { 1.0 };
+            let [space, time] = std::array::from_fn(|k| coarsest[k] * (finest[k] / coarsest[k]).powf(growth));
+            for &[a, b] in planes {
+                let size = Vec3::new(extent[a], extent[b], 1.0);
+                let scale = Vec3::new(space, space, time);
+                self.levels.push(Level::new([a, b, TIME], size, scale, 1usize << log2_rows));
+            }
+        }
+        self
     }
 
     /// Width of the encoding.
@@ -66,7 +102,8 @@ impl HashGrid {
 }
 
 impl Level {
-    fn new(extent: Vec3, scale: Vec3, max_rows: usize) -> Self {
+    /// `extent` is along `axes`.
+    fn new(axes: [usize; 3], extent: Vec3, scale: Vec3, max_rows: usize) -> Self {
         let cells = (extent * scale).ceil().max(Vec3::ONE).as_uvec3();
         let points = [cells.x + 1, cells.y + 1, cells.z + 1];
         let lattice = points.iter().map(|&p| p as usize).product::<usize>();
@@ -77,12 +114,12 @@ impl Level {
             // Instant-ngp's primes; 1 for x keeps neighbours in x on one cache line.
             ([1, 2_654_435_761, 805_459_861], max_rows)
         };
-        Self { scale, last_cell: [cells.x - 1, cells.y - 1, cells.z - 1], stride, rows, dense }
+        Self { axes, scale, last_cell: [cells.x - 1, cells.y - 1, cells.z - 1], stride, rows, dense }
     }
 
-    /// Writes the features of one tile of points (`pos`: x, y, z rows) to `out`, a row a point.
+    /// Writes the features of one tile of points to `out`, a row a point.
     #[inline(always)]
-    pub fn encode(&self, table: &[Row], pos: &[[f32; TILE]; 3], out: &mut [Row]) {
+    pub fn encode(&self, table: &[Row], pos: &Points, out: &mut [Row]) {
         let corners = self.corners(pos);
         for (s, out) in out.iter_mut().enumerate() {
             *out = corners.interpolate(table, s).0;
@@ -91,29 +128,26 @@ impl Level {
 
     /// As [`Self::encode`], and each point's derivatives of its features by x, y and z.
     #[inline(always)]
-    pub fn encode_with_slopes(
-        &self,
-        table: &[Row],
-        pos: &[[f32; TILE]; 3],
-        out: &mut [Row],
-        slopes: &mut [[Row; 3]],
-    ) {
+    pub fn encode_with_slopes(&self, table: &[Row], pos: &Points, out: &mut [Row], slopes: &mut [[Row; 3]]) {
         let corners = self.corners(pos);
         for (s, (out, slopes)) in out.iter_mut().zip(slopes).enumerate() {
-            let (value, [x, y, z]) = corners.interpolate(table, s);
+            let (value, by) = corners.interpolate(table, s);
             *out = value;
-            *slopes = [x * self.scale.x, y * self.scale.y, z * self.scale.z];
+            *slopes = [Row::ZERO; 3];
+            for k in (0..3).filter(|&k| self.axes[k] != TIME) {
+                slopes[self.axes[k]] = by[k] * self.scale[k];
+            }
         }
     }
 
     #[inline(always)]
-    fn corners(&self, pos: &[[f32; TILE]; 3]) -> Corners {
+    fn corners(&self, pos: &Points) -> Corners {
         let mut cell = [[0u32; TILE]; 3];
         let mut frac = [[0.0f32; TILE]; 3];
         for axis in 0..3 {
             let (scale, last) = (self.scale[axis], self.last_cell[axis] as f32);
             for s in 0..TILE {
-                let q = pos[axis][s] * scale;
+                let q = pos[self.axes[axis]][s] * scale;
                 // A point outside the box (or NaN) lands in the nearest cell (or the first).
                 let (index, c) = floor_within(q, last);
                 cell[axis][s] = index;
@@ -137,7 +171,7 @@ impl Level {
     /// Adds the gradients `g` of a tile's features to the rows around its points `pos`, by the weights with which
     /// they were read.
     #[inline(always)]
-    pub fn scatter(&self, grads: &mut [Row], pos: &[[f32; TILE]; 3], g: &[Row]) {
+    pub fn scatter(&self, grads: &mut [Row], pos: &Points, g: &[Row]) {
         let c = self.corners(pos);
         for (s, g) in g.iter().enumerate() {
             let (fx, fy, fz) = (c.frac[0][s], c.frac[1][s], c.frac[2][s]);

@@ -3,11 +3,11 @@
 
 use glam::Vec3;
 
-use super::hashgrid::{HashGrid, Level, Row};
+use super::hashgrid::{AXES, HashGrid, Level, Points, Row};
 use crate::rng::Rng;
 use crate::simd::TILE;
 
-type Tile = [[f32; TILE]; 3];
+type Tile = Points;
 
 const EXTENT: Vec3 = Vec3::new(1.0, 0.75, 0.5);
 
@@ -26,7 +26,7 @@ fn grid(seed: u64) -> (HashGrid, Vec<Vec<Row>>) {
 }
 
 fn tile(points: impl IntoIterator<Item = Vec3>) -> Tile {
-    let mut out = [[0.25; TILE]; 3];
+    let mut out = [[0.25; TILE]; AXES];
     for (lane, p) in points.into_iter().take(TILE).enumerate() {
         for axis in 0..3 {
             out[axis][lane] = p[axis];

@@ -8,7 +8,7 @@ use std::ops::Range;
 use glam::Vec3;
 use pulp::Simd;
 
-use super::hashgrid::{FEATURES, HashGrid, Level, Row};
+use super::hashgrid::{AXES, FEATURES, HashGrid, Level, Points, Row, TIME};
 use super::mlp::{Activations, Mlp, Packed};
 use crate::simd::matrix::Unit;
 use crate::simd::{self, TILE};
@@ -92,7 +92,7 @@ pub struct StreamBatch {
     /// Which ray each lane belongs to; lanes of a ray follow one another and share its code and view.
     ray: Vec<u32>,
     /// Positions, tile by tile.
-    pos: Vec<[[f32; TILE]; 3]>,
+    pos: Vec<Points>,
     /// The encoding, level by level.
     pub levels: Vec<LevelRows>,
     /// Whether the gradient with respect to the positions will be asked for.
@@ -107,17 +107,18 @@ impl StreamBatch {
         self.pos.clear();
     }
 
-    /// Adds sample number `sample` of the chunk, of ray number `ray`, at `p`.
+    /// Adds sample number `sample` of the chunk, of ray number `ray`, at `p` and `time` (0–1 over the video).
     #[inline(always)]
-    pub fn push(&mut self, sample: usize, ray: usize, p: Vec3) {
+    pub fn push(&mut self, sample: usize, ray: usize, p: Vec3, time: f32) {
         let lane = self.sample.len() % TILE;
         if lane == 0 {
-            self.pos.push([[0.5; TILE]; 3]);
+            self.pos.push([[0.5; TILE]; AXES]);
         }
         let tile = self.pos.len() - 1;
         for axis in 0..3 {
             self.pos[tile][axis][lane] = p[axis];
         }
+        self.pos[tile][TIME][lane] = time;
         self.sample.push(sample as u32);
         self.ray.push(ray as u32);
     }
@@ -132,8 +133,8 @@ impl StreamBatch {
         self.sample.is_empty()
     }
 
-    /// Positions tile by tile, `[axis][lane]`.
-    pub fn tiles(&self) -> &[[[f32; TILE]; 3]] {
+    /// Positions tile by tile.
+    pub fn tiles(&self) -> &[Points] {
         &self.pos
     }
 
@@ -145,8 +146,8 @@ impl StreamBatch {
     /// Number in the chunk and position of every sample.
     #[inline(always)]
     pub fn points(&self) -> impl Iterator<Item = (usize, Vec3)> + '_ {
-        let at = |n: usize| self.pos[n / TILE].map(|axis| axis[n % TILE]);
-        self.sample.iter().enumerate().map(move |(n, s)| (*s as usize, Vec3::from_array(at(n))))
+        let at = |n: usize| Vec3::from_array([0, 1, 2].map(|axis| self.pos[n / TILE][axis][n % TILE]));
+        self.sample.iter().enumerate().map(move |(n, s)| (*s as usize, at(n)))
     }
 
     /// The encoding to be made of the samples, level by level: see [`LevelTask::run`].
@@ -174,7 +175,7 @@ impl StreamBatch {
 pub struct LevelTask<'a> {
     level: &'a Level,
     table: &'a [Row],
-    pos: &'a [[[f32; TILE]; 3]],
+    pos: &'a [Points],
     lanes: usize,
     slopes: bool,
     out: &'a mut LevelRows,

@@ -341,16 +341,16 @@ impl Chunk {
                 let p = ray.origin + ray.dir * t;
                 let threshold = &model.grids.threshold;
                 if model.streams[0] && grid_p.at(p, 0) >= threshold[0] {
-                    self.batches[0].push(sample, r, p);
+                    self.batches[0].push(sample, r, p, view.time);
                 }
                 if model.streams[1] && grid_d.at(p, slice_d) >= threshold[1] {
-                    self.batches[1].push(sample, r, p);
+                    self.batches[1].push(sample, r, p, view.time);
                 }
                 let z = t * input.dir_cam.z;
                 if model.streams[2] && z < field.actor_far {
                     let q = model.actor_point(input.uv, z);
                     if grid_a.at(q, slice_a) >= threshold[2] {
-                        self.batches[2].push(sample, r, q);
+                        self.batches[2].push(sample, r, q, view.time);
                     }
                 }
             }

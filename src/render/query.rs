@@ -15,6 +15,7 @@ pub struct Query<'a> {
     stream: Stream,
     net: &'a StreamNet,
     code: Vec<f32>,
+    time: f32,
     /// Slice of the density grid.
     slice: usize,
 }
@@ -30,7 +31,7 @@ impl<'a> Query<'a> {
             trajectory.evaluate(gamma, trajectory.locate(time), &mut code);
         }
         let slice = model.grids.streams[stream as usize].slice(time);
-        Some(Self { model, stream, net, code, slice })
+        Some(Self { model, stream, net, code, time, slice })
     }
 
     /// Which stream is asked.
@@ -45,7 +46,7 @@ impl<'a> Query<'a> {
         out.fill(0.0);
         let mut batch = StreamBatch::default();
         for (n, p) in points.iter().enumerate().filter(|(_, p)| grid.at(**p, self.slice) >= threshold) {
-            batch.push(n, 0, *p);
+            batch.push(n, 0, *p, self.time);
         }
         let Some(weights) = self.model.weights(s) else { return };
         if batch.is_empty() {
@@ -64,7 +65,7 @@ impl<'a> Query<'a> {
     pub fn colours(&self, points: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
         let Some(weights) = self.model.weights(self.stream as usize) else { return Vec::new() };
         let mut batch = StreamBatch::default();
-        points.iter().enumerate().for_each(|(n, p)| batch.push(n, n, *p));
+        points.iter().enumerate().for_each(|(n, p)| batch.push(n, n, *p, self.time));
         let views: Vec<_> = directions.iter().map(|d| view_encoding(*d)).collect();
         let mut out = StreamSamples::default();
         out.reset(points.len());

@@ -84,6 +84,8 @@ pub struct StereoDepth {
     height: usize,
     focal: Vec2,
     principal: Vec2,
+    /// Refinement of the lens that the directions asked for do not have yet.
+    lens: [f32; 2],
     /// Depth along the camera's axis; 0 where it is not known. `[height * width]`.
     pub depth: Vec<f32>,
 }
@@ -95,12 +97,14 @@ impl StereoDepth {
         let (width, height) = (camera.width as usize, camera.height as usize);
         let focal = Vec2::new(camera.fx as f32, camera.fy as f32);
         let principal = Vec2::new(camera.cx as f32, camera.cy as f32);
-        Self { width, height, focal, principal, depth: vec![depth; width * height] }
+        Self { width, height, focal, principal, lens: [0.0; 2], depth: vec![depth; width * height] }
     }
 
     /// Depth along the camera's axis in the direction `dir` (camera axes); `None` where it is not known.
     pub fn at(&self, dir: Vec3) -> Option<f32> {
-        let p = dir.truncate() / dir.z * self.focal + self.principal;
+        let slope = dir.truncate() / dir.z;
+        let [focal, radial] = self.lens;
+        let p = slope * (1.0 + focal + radial * slope.length_squared()) * self.focal + self.principal;
         let inside = dir.z > 0.0
             && p.cmpge(Vec2::ZERO).all()
             && p.cmplt(Vec2::new(self.width as f32, self.height as f32)).all();
@@ -108,9 +112,10 @@ impl StereoDepth {
         (depth > 0.0).then_some(depth)
     }
 
-    /// From now on directions are given by a camera whose focal length is `by` times as long.
-    pub fn stretch(&mut self, by: f32) {
-        self.focal *= by;
+    /// From now on directions are given as they are before a field's refinement of the lens
+    /// ([`crate::render::rays::View::lens`]).
+    pub fn refine(&mut self, lens: [f32; 2]) {
+        self.lens = lens;
     }
 
     /// Share of pixels with a depth.
@@ -141,6 +146,7 @@ pub fn depths(frames: &[StereoFrame], farthest: f32, config: &StereoConfig) -> V
                 height: v.height,
                 focal: v.focal,
                 principal: v.principal,
+                lens: [0.0; 2],
                 depth: consistency::keep_agreeing(&views, &raw, n, &neighbours[n], config),
             }
         })

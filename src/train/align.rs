@@ -31,8 +31,8 @@ const PRIOR: f64 = 0.2;
 /// A frame that would move farther than this (rad, units) is left where it is.
 const LARGEST: f64 = 0.05;
 
-/// The same for the focal length, which trades against the distance of everything.
-const SHARED_PRIOR: f64 = 0.02;
+/// The same for the lens: its focal length trades against the distance of everything, its bend against nothing.
+const LENS_PRIOR: [f64; SHARED] = [0.02, 0.002];
 
 /// A frame is moved if that makes its residuals this much smaller: poses that are right stay as they are.
 const WORTH_IT: f64 = 0.99;
@@ -43,6 +43,9 @@ const OUTLIER: f64 = 0.2;
 /// Unknowns of a frame: rotation, translation, gain and offset of its brightness.
 const UNKNOWNS: usize = 8;
 
+/// Unknowns of the lens that all frames share: focal length and its growth with the squared distance from the axis.
+const SHARED: usize = 2;
+
 /// What an alignment changed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Alignment {
@@ -52,8 +55,8 @@ pub struct Alignment {
     pub rotation: f64,
     /// Root of the mean squared translation, units.
     pub translation: f64,
-    /// Relative change of the focal length.
-    pub focal: f64,
+    /// Relative change of the focal length, and of its growth with the squared distance from the axis.
+    pub lens: [f64; SHARED],
 }
 
 /// What [`align`] found; [`Correction::apply`] adds it to the field.
@@ -69,17 +72,17 @@ pub fn align(model: &Model, pixels: &PixelSet, sampling: &Sampling) -> Correctio
     let field = model.field;
     let mut frames: Vec<Registration> =
         (0..pixels.frames.len()).map(|n| Registration::new(model, pixels, n, sampling)).collect();
-    let field_focal = f64::from(field.weights[field.layout.rig.start + 6]);
-    let mut focal = 0.0;
+    let given = |k: usize| f64::from(field.weights[field.layout.rig.start + 6 + k]);
+    let mut lens = [0.0; SHARED];
     for _ in 0..ITERATIONS {
-        let systems: Vec<System> = frames.par_iter().map(|f| f.system(focal)).collect();
-        let shared = solve_focal(&systems, field_focal + focal);
-        focal += shared;
+        let systems: Vec<System> = frames.par_iter().map(|f| f.system(lens)).collect();
+        let shared = solve_shared(&systems, std::array::from_fn(|k| given(k) + lens[k]));
+        (0..SHARED).for_each(|k| lens[k] += shared[k]);
         frames.par_iter_mut().zip(&systems).for_each(|(f, s)| f.step(s, shared));
     }
     let mut change = vec![0.0; field.layout.pose.len()];
     let mut count = vec![0.0f32; field.pose.knots.len()];
-    let mut report = Alignment { focal, ..Alignment::default() };
+    let mut report = Alignment { lens, ..Alignment::default() };
     for f in &frames {
         let Some(delta) = f.accepted() else { continue };
         report.frames += 1;
@@ -103,13 +106,15 @@ pub fn align(model: &Model, pixels: &PixelSet, sampling: &Sampling) -> Correctio
 }
 
 impl Correction {
-    /// Moves the poses and the focal length of a field; what all frames have in common goes to the rig.
+    /// Moves the poses and the lens of a field; what all frames have in common goes to the rig.
     pub fn apply(&self, field: &mut Field) {
         let (pose, rig) = (field.layout.pose.clone(), field.layout.rig.start);
         for (w, c) in field.weights[pose.clone()].iter_mut().zip(&self.poses) {
             *w += c;
         }
-        field.weights[rig + 6] += self.report.focal as f32;
+        for (w, change) in field.weights[rig + 6..].iter_mut().zip(self.report.lens) {
+            *w += change as f32;
+        }
         let (width, knots) = (field.pose.width, field.pose.knots.len() as f32);
         for k in 0..width {
             let column = pose.clone().skip(k).step_by(width);
@@ -143,13 +148,13 @@ struct Point {
     grey: f64,
 }
 
-/// Normal equations of one frame: its own unknowns, the shared focal length and their coupling.
+/// Normal equations of one frame: its own unknowns, the shared lens and their coupling.
 struct System {
     own: [[f64; UNKNOWNS]; UNKNOWNS],
     right: [f64; UNKNOWNS],
-    coupling: [f64; UNKNOWNS],
-    focal: f64,
-    focal_right: f64,
+    coupling: [[f64; UNKNOWNS]; SHARED],
+    shared: [[f64; SHARED]; SHARED],
+    shared_right: [f64; SHARED],
     /// Mean size of the residuals, outliers cut off.
     cost: f64,
 }
@@ -191,26 +196,22 @@ impl<'a> Registration<'a> {
     }
 
     /// Where the frame's image shows a point if its pose were changed by the unknowns found so far.
-    fn project(&self, to_camera: &DMat3, shift: DVec3, point: DVec3) -> Option<(DVec3, DVec2)> {
-        let p = *to_camera * (point - shift);
+    fn project(&self, bend: &Bend, shift: DVec3, point: DVec3) -> Option<(DVec3, DVec2)> {
+        let p = bend.undo(point - shift)?;
         Some((p, self.camera.project(p)?))
     }
 
-    fn system(&self, focal: f64) -> System {
+    fn system(&self, lens: [f64; SHARED]) -> System {
         let u = &self.unknowns;
         let r = &self.view.refinement;
         let turn = DVec3::new(f64::from(r[0]) + u[0], f64::from(r[1]) + u[1], f64::from(r[2]) + u[2]);
-        let zoom = f64::from(self.view.focal) + focal;
-        // The refined direction is (1 + [turn]x + zoom diag(1, 1, 0)) times the pixel's: undo it.
-        let skew = DMat3::from_cols(turn.cross(DVec3::X), turn.cross(DVec3::Y), turn.cross(DVec3::Z));
-        let to_camera =
-            (DMat3::IDENTITY + skew + DMat3::from_diagonal(DVec3::new(zoom, zoom, 0.0))).inverse();
+        let bend = Bend { turn, lens: std::array::from_fn(|k| f64::from(self.view.lens[k]) + lens[k]) };
         let shift = DVec3::new(u[3], u[4], u[5]);
         let rows: Vec<Row> = self
             .points
             .iter()
             .filter_map(|point| {
-                let (p, uv) = self.project(&to_camera, shift, point.position)?;
+                let (p, uv) = self.project(&bend, shift, point.position)?;
                 let (value, gradient) = self.grey.at(uv)?;
                 let residual = value - ((1.0 + u[6]) * point.grey + u[7]);
                 let along_x = gradient.x * self.camera.fx / p.z;
@@ -221,7 +222,7 @@ impl<'a> Registration<'a> {
                 Some(Row {
                     residual,
                     by: [by_turn.x, by_turn.y, by_turn.z, -g.x, -g.y, -g.z, -point.grey, -1.0],
-                    by_focal: -(g.x * p.x + g.y * p.y),
+                    by_lens: [1.0, off_axis(p)].map(|r| -r * (g.x * p.x + g.y * p.y)),
                 })
             })
             .collect();
@@ -229,12 +230,13 @@ impl<'a> Registration<'a> {
         System::new(&rows, &moved, u)
     }
 
-    fn step(&mut self, system: &System, focal: f64) {
+    fn step(&mut self, system: &System, lens: [f64; SHARED]) {
         if self.start.is_infinite() {
             self.start = system.cost;
         }
         self.last = system.cost;
-        let right = std::array::from_fn(|k| system.right[k] - system.coupling[k] * focal);
+        let through = |k: usize| (0..SHARED).map(|j| system.coupling[j][k] * lens[j]).sum::<f64>();
+        let right = std::array::from_fn(|k| system.right[k] - through(k));
         let Some(step) = solve(&system.own, right) else { return };
         for (u, s) in self.unknowns.iter_mut().zip(step) {
             *u += s;
@@ -249,11 +251,37 @@ impl<'a> Registration<'a> {
     }
 }
 
+/// How refinement changes a pixel's direction v: v + turn × v + (lens₀ + lens₁ r²) (v_x, v_y, 0).
+struct Bend {
+    turn: DVec3,
+    lens: [f64; SHARED],
+}
+
+impl Bend {
+    /// The direction that the refinement turns into `p`; `None` where there is none in front of the camera.
+    fn undo(&self, p: DVec3) -> Option<DVec3> {
+        let t = self.turn;
+        let skew = DMat3::from_cols(t.cross(DVec3::X), t.cross(DVec3::Y), t.cross(DVec3::Z));
+        let mut v = p;
+        // r² changes little by what is undone: the second round is exact to 1e-6 for any lens of a camera.
+        for _ in 0..3 {
+            let zoom = self.lens[0] + self.lens[1] * off_axis(v);
+            v = (DMat3::IDENTITY + skew + DMat3::from_diagonal(DVec3::new(zoom, zoom, 0.0))).inverse() * p;
+        }
+        (v.is_finite() && v.z > 0.0).then_some(v)
+    }
+}
+
+/// Squared distance from the optical axis in the plane at depth 1.
+fn off_axis(p: DVec3) -> f64 {
+    (p.x * p.x + p.y * p.y) / (p.z * p.z)
+}
+
 /// One pixel's equation.
 struct Row {
     residual: f64,
     by: [f64; UNKNOWNS],
-    by_focal: f64,
+    by_lens: [f64; SHARED],
 }
 
 impl System {
@@ -265,9 +293,9 @@ impl System {
         let mut s = Self {
             own: [[0.0; UNKNOWNS]; UNKNOWNS],
             right: [0.0; UNKNOWNS],
-            coupling: [0.0; UNKNOWNS],
-            focal: 0.0,
-            focal_right: 0.0,
+            coupling: [[0.0; UNKNOWNS]; SHARED],
+            shared: [[0.0; SHARED]; SHARED],
+            shared_right: [0.0; SHARED],
             cost: rows.iter().map(|r| r.residual.abs().min(OUTLIER)).sum::<f64>() / rows.len().max(1) as f64,
         };
         for row in rows {
@@ -277,10 +305,12 @@ impl System {
                     s.own[i][j] += weight * row.by[i] * row.by[j];
                 }
                 s.right[i] -= weight * row.by[i] * row.residual;
-                s.coupling[i] += weight * row.by[i] * row.by_focal;
+                (0..SHARED).for_each(|j| s.coupling[j][i] += weight * row.by[i] * row.by_lens[j]);
             }
-            s.focal += weight * row.by_focal * row.by_focal;
-            s.focal_right -= weight * row.by_focal * row.residual;
+            for i in 0..SHARED {
+                (0..SHARED).for_each(|j| s.shared[i][j] += weight * row.by_lens[i] * row.by_lens[j]);
+                s.shared_right[i] -= weight * row.by_lens[i] * row.residual;
+            }
         }
         for k in 0..6 {
             let prior = PRIOR * s.own[k][k] + 1e-6;
@@ -295,18 +325,24 @@ impl System {
     }
 }
 
-/// The change of focal length that suits all frames (Schur complement of their own unknowns).
-fn solve_focal(systems: &[System], total: f64) -> f64 {
-    let prior = SHARED_PRIOR * systems.iter().map(|s| s.focal).sum::<f64>();
-    let (mut h, mut b) = (prior, -prior * total);
-    for s in systems {
-        let (Some(through), Some(own)) = (solve(&s.own, s.coupling), solve(&s.own, s.right)) else {
-            continue;
-        };
-        h += s.focal - dot(&s.coupling, &through);
-        b += s.focal_right - dot(&s.coupling, &own);
+/// The change of the lens that suits all frames (Schur complement of their own unknowns); `total` is what it is by now.
+fn solve_shared(systems: &[System], total: [f64; SHARED]) -> [f64; SHARED] {
+    let (mut h, mut b) = ([[0.0; SHARED]; SHARED], [0.0; SHARED]);
+    for k in 0..SHARED {
+        let prior = LENS_PRIOR[k] * systems.iter().map(|s| s.shared[k][k]).sum::<f64>();
+        (h[k][k], b[k]) = (prior, -prior * total[k]);
     }
-    if h > 0.0 { b / h } else { 0.0 }
+    for s in systems {
+        let Some(own) = solve(&s.own, s.right) else { continue };
+        for i in 0..SHARED {
+            let Some(through) = solve(&s.own, s.coupling[i]) else { continue };
+            for j in 0..SHARED {
+                h[i][j] += s.shared[i][j] - dot(&s.coupling[j], &through);
+            }
+            b[i] += s.shared_right[i] - dot(&s.coupling[i], &own);
+        }
+    }
+    solve(&h, b).unwrap_or_default()
 }
 
 fn dot(a: &[f64; UNKNOWNS], b: &[f64; UNKNOWNS]) -> f64 {
@@ -314,9 +350,9 @@ fn dot(a: &[f64; UNKNOWNS], b: &[f64; UNKNOWNS]) -> f64 {
 }
 
 /// Solves a symmetric positive definite system by Cholesky's method; `None` if it is not.
-fn solve(matrix: &[[f64; UNKNOWNS]; UNKNOWNS], right: [f64; UNKNOWNS]) -> Option<[f64; UNKNOWNS]> {
-    let mut l = [[0.0; UNKNOWNS]; UNKNOWNS];
-    for i in 0..UNKNOWNS {
+fn solve<const N: usize>(matrix: &[[f64; N]; N], right: [f64; N]) -> Option<[f64; N]> {
+    let mut l = [[0.0; N]; N];
+    for i in 0..N {
         for j in 0..=i {
             let sum = matrix[i][j] - (0..j).map(|k| l[i][k] * l[j][k]).sum::<f64>();
             if i == j {
@@ -330,11 +366,11 @@ fn solve(matrix: &[[f64; UNKNOWNS]; UNKNOWNS], right: [f64; UNKNOWNS]) -> Option
         }
     }
     let mut x = right;
-    for i in 0..UNKNOWNS {
+    for i in 0..N {
         x[i] = (x[i] - (0..i).map(|k| l[i][k] * x[k]).sum::<f64>()) / l[i][i];
     }
-    for i in (0..UNKNOWNS).rev() {
-        x[i] = (x[i] - (i + 1..UNKNOWNS).map(|k| l[k][i] * x[k]).sum::<f64>()) / l[i][i];
+    for i in (0..N).rev() {
+        x[i] = (x[i] - (i + 1..N).map(|k| l[k][i] * x[k]).sum::<f64>()) / l[i][i];
     }
     Some(x)
 }
@@ -447,7 +483,7 @@ mod tests {
             centre: Vec3::ZERO,
             rotation: Mat3::IDENTITY,
             refinement: [0.0; 6],
-            focal: 0.0,
+            lens: [0.0; 2],
             knots,
             time: 0.0,
             code_knots: [None; 3],
@@ -468,8 +504,8 @@ mod tests {
 
     fn register(mut frame: Registration) -> Option<[f64; 6]> {
         for _ in 0..ITERATIONS {
-            let system = frame.system(0.0);
-            frame.step(&system, 0.0);
+            let system = frame.system([0.0; 2]);
+            frame.step(&system, [0.0; 2]);
         }
         frame.accepted()
     }
@@ -506,26 +542,29 @@ mod tests {
     fn frames_that_see_nothing_stay_and_do_not_break_the_others() {
         let mut blind = displaced(DVec3::ZERO, DVec3::ZERO, 0.0);
         blind.points.clear();
-        let systems = [blind.system(0.0), displaced(DVec3::ZERO, DVec3::ZERO, 0.0).system(0.0)];
-        assert!(solve_focal(&systems, 0.0).abs() < 1e-3);
+        let systems = [blind.system([0.0; 2]), displaced(DVec3::ZERO, DVec3::ZERO, 0.0).system([0.0; 2])];
+        assert!(solve_shared(&systems, [0.0; 2]).iter().all(|l| l.abs() < 1e-3));
         assert!(register(blind).is_none_or(|moved| moved == [0.0; 6]));
     }
 
     #[test]
-    fn a_longer_focal_length_is_found() {
-        let mut frame = displaced(DVec3::ZERO, DVec3::ZERO, 0.0);
-        for p in &mut frame.points {
-            // Directions were stretched by too little: the true ones are 2 % farther from the axis.
-            p.position.x *= 1.02;
-            p.position.y *= 1.02;
+    fn another_lens_is_found() {
+        for truth in [[0.02, 0.0], [0.01, 0.05]] {
+            let mut frame = displaced(DVec3::ZERO, DVec3::ZERO, 0.0);
+            for p in &mut frame.points {
+                // Directions were stretched by too little.
+                let zoom = 1.0 + truth[0] + truth[1] * off_axis(p.position);
+                p.position *= DVec3::new(zoom, zoom, 1.0);
+            }
+            let mut lens = [0.0; SHARED];
+            for _ in 0..ITERATIONS {
+                let system = frame.system(lens);
+                let step = solve_shared(std::slice::from_ref(&system), lens);
+                (0..SHARED).for_each(|k| lens[k] += step[k]);
+                frame.step(&system, step);
+            }
+            let off = |r2: f64| lens[0] - truth[0] + (lens[1] - truth[1]) * r2;
+            assert!(off(0.1).abs() < 0.006 && off(0.3).abs() < 0.006, "{lens:?} is not {truth:?}");
         }
-        let mut focal = 0.0;
-        for _ in 0..ITERATIONS {
-            let system = frame.system(focal);
-            let step = solve_focal(std::slice::from_ref(&system), focal);
-            focal += step;
-            frame.step(&system, step);
-        }
-        assert!((focal - 0.02).abs() < 0.006, "{focal}");
     }
 }

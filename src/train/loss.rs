@@ -2,9 +2,12 @@
 
 use serde::{Deserialize, Serialize};
 
+use self::flatness::Bend;
 use crate::field::stream::StreamSamples;
 use crate::render::composite::{Interval, Weighted};
 use crate::render::forward::Chunk;
+
+pub mod flatness;
 
 /// Relative error of stereo depth that costs nothing.
 pub(super) const STEREO_ERROR: f32 = 0.01;
@@ -28,6 +31,8 @@ pub struct LossConfig {
     pub entropy: f32,
     /// Price of stopping light where stereo says that a ray passes or that it has already ended.
     pub depth: f32,
+    /// Price of a bend in depth where the picture is even.
+    pub flatness: f32,
     /// Price of per-frame exposure away from none: times half the squares of its six numbers.
     pub exposure: f32,
 }
@@ -41,6 +46,7 @@ impl Default for LossConfig {
             distortion: 0.3,
             entropy: 0.0,
             depth: 4.0,
+            flatness: 1.0,
             exposure: 0.1,
         }
     }
@@ -66,6 +72,8 @@ pub struct ChunkGradient {
     pub samples: [StreamSamples; 3],
     /// With respect to the six exposure numbers of each ray.
     pub exposure: Vec<[f32; 6]>,
+    /// With respect to the disparity of each ray.
+    disparity: Vec<f32>,
 }
 
 /// The colour that a ray should have, and how it was exposed.
@@ -87,6 +95,7 @@ pub fn backward(
     config: &LossConfig,
     chunk: &Chunk,
     targets: &[RayTarget],
+    bends: &[Bend],
     count: usize,
     scale: f32,
     grad: &mut ChunkGradient,
@@ -98,7 +107,8 @@ pub fn backward(
     for s in &mut grad.samples {
         s.reset(total);
     }
-    let mut loss = ChunkLoss::default();
+    let bent = flatness::backward(config.flatness, chunk, bends, count, scale, &mut grad.disparity);
+    let mut loss = ChunkLoss { total: f64::from(bent), ..ChunkLoss::default() };
     for (r, target) in targets.iter().enumerate() {
         let ray = &chunk.rays[r];
         let range = r * count..(r + 1) * count;
@@ -158,6 +168,14 @@ pub fn backward(
                 extra += price * chunk.weighted[k].total();
                 for g in &mut grad.weight[k] {
                     *g += scale * price;
+                }
+            }
+        }
+        if config.flatness > 0.0 {
+            let d = grad.disparity[r] / ray.ray.refined_cam.z;
+            for k in range.clone() {
+                for g in &mut grad.weight[k] {
+                    *g += d / chunk.intervals[k].t;
                 }
             }
         }

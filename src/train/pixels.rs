@@ -4,7 +4,7 @@ use glam::DAffine3;
 use rayon::prelude::*;
 
 use crate::field::Field;
-use crate::render::rays::{PixelDirections, pixel_directions};
+use crate::render::rays::{PixelDirections, View, pixel_directions};
 use crate::render::refined::refined_camera;
 use crate::scene::{Camera, Frame, SceneError};
 use crate::stereo::{self, StereoConfig, StereoDepth, StereoFrame};
@@ -73,9 +73,9 @@ impl PixelSet {
             .map(|((camera, c2w), rgb)| StereoFrame { camera, c2w: *c2w, rgb })
             .collect();
         self.stereo = stereo::depths(&frames, n.extent.length(), config);
-        for ((depth, frame), (refined, _)) in self.stereo.iter_mut().zip(&self.frames).zip(&cameras) {
+        for (depth, frame) in self.stereo.iter_mut().zip(&self.frames) {
             // Asked by the directions that the scene's own intrinsics give.
-            depth.stretch((frame.camera.fx / refined.fx) as f32);
+            depth.refine(View::new(field, frame).lens);
         }
         let coverage = self.stereo.iter().map(StereoDepth::coverage).sum::<f64>();
         tracing::info!(coverage = coverage / self.frames.len().max(1) as f64, "depth by stereo");

@@ -241,7 +241,7 @@ impl Trainer {
         let correction = align::align(&model, &self.pixels, &sampling);
         correction.apply(&mut self.trained.field);
         let a = correction.report;
-        tracing::info!(a.frames, a.rotation, a.translation, a.focal, "frames aligned");
+        tracing::info!(a.frames, a.rotation, a.translation, lens = ?a.lens, "frames aligned");
     }
 
     /// Finds the depth of the training frames by stereo: from where they are by now, or from where they were when a

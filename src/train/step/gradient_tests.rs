@@ -85,8 +85,14 @@ fn trace_with(seed: u64, precision: Precision) -> Traced {
     plan.pose_rate = 1.0;
     plan.rig_rate = 1.0;
     // Large enough that one per cent of a term is more than the tolerance.
-    let config =
-        LossConfig { transient: 0.1, distortion: 10.0, entropy: 5.0, exposure: 100.0, ..config.loss };
+    let config = LossConfig {
+        transient: 0.1,
+        distortion: 10.0,
+        entropy: 5.0,
+        flatness: 5.0,
+        exposure: 100.0,
+        ..config.loss
+    };
     let (chunk, dense, tables) = (TrainChunk::default(), vec![0.0; layout.len], Default::default());
     let mut traced = Traced { field, pixels, config, plan, chunk, loss: 0.0, dense, tables };
     traced.run(&grids, seed);
@@ -154,6 +160,7 @@ impl Traced {
             chunk: &self.chunk.traced,
             inputs: &self.chunk.inputs,
             targets: &self.chunk.targets,
+            bends: &self.chunk.bends,
             config: &self.config,
             count: self.plan.sampling.count,
         })
@@ -195,7 +202,7 @@ impl Traced {
         six("exposure", &layout.exposure, ["gain", "offset"]);
         six("pose", &layout.pose, ["rotation", "translation"]);
         six("rig", &(layout.rig.start..layout.rig.start + 6), ["rotation", "translation"]);
-        groups.push(("focal length".into(), Place::Weights, layout.rig.start + 6..layout.rig.end));
+        groups.push(("lens".into(), Place::Weights, layout.rig.start + 6..layout.rig.end));
         groups
     }
 
@@ -323,12 +330,13 @@ fn a_group_without_gradient_is_found() {
 #[test]
 fn a_term_that_is_off_by_one_per_cent_is_found() {
     let traced = trace(1);
-    let wrong: [fn(&mut LossConfig); 8] = [
+    let wrong: [fn(&mut LossConfig); 9] = [
         |c| c.beta_min *= 1.01,
         |c| c.transient *= 1.01,
         |c| c.transient_opacity[0] *= 1.01,
         |c| c.transient_opacity[1] *= 1.01,
         |c| c.depth *= 1.01,
+        |c| c.flatness *= 1.01,
         |c| c.distortion *= 1.01,
         |c| c.entropy *= 1.01,
         |c| c.exposure *= 1.01,

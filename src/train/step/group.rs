@@ -10,6 +10,7 @@ use crate::render::forward::{Chunk, Model, RayInput, Tracer};
 use crate::render::rays::View;
 use crate::rng::Rng;
 use crate::simd::TILE;
+use crate::train::loss::flatness::{self, Bend};
 use crate::train::loss::{self, ChunkGradient, ChunkLoss, LossConfig, RayTarget};
 use crate::train::pixels::PixelSet;
 
@@ -38,6 +39,7 @@ pub struct Context<'a> {
 pub struct TrainChunk {
     pub inputs: Vec<RayInput>,
     pub targets: Vec<RayTarget>,
+    pub bends: Vec<Bend>,
     pub traced: Chunk,
 }
 
@@ -163,6 +165,7 @@ impl TrainChunk {
                 depth: pixels.stereo_distance(frame, pixel),
             });
         }
+        flatness::find(&self.inputs, &self.targets, side as usize, &mut self.bends);
     }
 
     /// Places the samples of the chunk with number `number`.
@@ -191,7 +194,7 @@ impl TrainChunk {
         let count = context.plan.sampling.count;
         self.traced.evaluate(simd, tracer, context.model, count);
         let scale = 1.0 / context.rays as f32;
-        loss::backward(context.config, &self.traced, &self.targets, count, scale, gradient)
+        loss::backward(context.config, &self.traced, &self.targets, &self.bends, count, scale, gradient)
     }
 
     /// Adds the gradients of all dense weights to `dense`, and leaves those of the encodings in the batches.
@@ -249,13 +252,14 @@ impl TrainChunk {
         }
         for ((input, ray), (d_origin, d_dir)) in inputs.iter().zip(&traced.rays).zip(rays) {
             let view = &context.views[input.view as usize];
-            let (g, focal) = view.backward(&ray.ray, d_origin, d_dir);
+            let (g, lens) = view.backward(&ray.ray, d_origin, d_dir);
             field.pose.backward(view.knots, &g, &mut dense[field.layout.pose.clone()]);
             let rig = &mut dense[field.layout.rig.clone()];
             for (r, g) in rig.iter_mut().zip(g) {
                 *r += g;
             }
-            rig[6] += focal;
+            rig[6] += lens[0];
+            rig[7] += lens[1];
         }
     }
 }
@@ -281,7 +285,7 @@ impl Refresh {
             let cell = rng.below(grid.sigma.len());
             let u = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform());
             let (p, time) = grid.point(cell, u, rng.uniform());
-            self.batch.push(k, k, p);
+            self.batch.push(k, k, p, time);
             self.slices.push(grid.slice(time));
             if let Some(code) = &field.codes[s] {
                 let gamma = &field.weights[field.layout.streams[s].code.clone()];
