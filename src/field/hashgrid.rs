@@ -129,13 +129,7 @@ impl Level {
 
     /// As [`Self::encode`], and each point's derivatives of its features by x, y and z.
     #[inline(always)]
-    pub fn encode_with_slopes(
-        &self,
-        table: &[Row],
-        pos: &Points,
-        out: &mut [Row],
-        slopes: &mut [[Row; 3]],
-    ) {
+    pub fn encode_with_slopes(&self, table: &[Row], pos: &Points, out: &mut [Row], slopes: &mut [[Row; 3]]) {
         let (corners, after) = self.around(pos);
         for (s, (out, slopes)) in out.iter_mut().zip(slopes).enumerate() {
             let (mut value, mut by) = corners.interpolate(table, s);

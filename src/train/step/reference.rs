@@ -116,7 +116,7 @@ impl Reference<'_> {
                 let wrong = (((t - depth).abs() / depth - free) / (whole - free)).clamp(0.0, 1.0);
                 price += f64::from(c.depth) * wrong * total;
             }
-            *disparity += total / (t * f64::from(self.chunk.rays[r].ray.refined_cam.z));
+            *disparity += total / (t.max(1e-6) * f64::from(self.chunk.rays[r].ray.refined_cam.z));
             entropy += light * alpha * (1.0 - alpha);
             weights.push((total, f64::from(i.t), delta));
             light *= 1.0 - alpha;
