@@ -100,7 +100,7 @@ fn trace_with(seed: u64, precision: Precision) -> Traced {
         transient: 1.0,
         distortion: 10.0,
         entropy: 5.0,
-        flatness: 5.0,
+        flatness: 300.0,
         exposure: 100.0,
         ..config.loss
     };
