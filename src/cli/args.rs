@@ -203,6 +203,38 @@ pub enum LayerArg {
     Normal,
     /// Opacity of each stream
     Stream,
+    /// Compressed image-language features
+    Clip,
+    /// Compressed video-language features
+    Egovideo,
+    /// Scores of the phrases asked for
+    Relevancy,
+}
+
+/// The two spaces of features.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SpaceArg {
+    /// Image-language: what things are
+    Clip,
+    /// Video-language: what can be done with them
+    Egovideo,
+}
+
+/// What is asked of the features.
+#[derive(Debug, Args)]
+pub struct TextArgs {
+    /// A phrase to look for, as often as needed
+    #[arg(long, value_name = "PHRASE")]
+    pub text: Vec<String>,
+    /// Space that phrases are looked for in
+    #[arg(long, value_enum, default_value = "clip")]
+    pub space: SpaceArg,
+    /// Embeddings of the phrases, one row for each --text in order, of shape [Q, D] or [D]
+    #[arg(long, value_name = "F.npy", requires = "text")]
+    pub text_embedding: Option<PathBuf>,
+    /// Temperature of the relevancy [default: that of the run]
+    #[arg(long, value_name = "TAU")]
+    pub temperature: Option<f32>,
 }
 
 /// `divff render`.
@@ -225,6 +257,8 @@ pub struct RenderArgs {
     /// Layers of the EXR files
     #[arg(long, value_enum, value_delimiter = ',', default_values = ["rgb", "depth", "stream"])]
     pub layers: Vec<LayerArg>,
+    #[command(flatten)]
+    pub text: TextArgs,
     /// Where the scene is, if it was moved
     #[arg(long, value_name = "SCENE")]
     pub scene: Option<PathBuf>,

@@ -6,6 +6,7 @@ mod error;
 mod inspect;
 mod output;
 mod progress;
+mod query;
 mod run;
 mod settings;
 mod stop;

@@ -15,23 +15,27 @@ use crate::render::image::{RenderedFrame, render};
 use crate::render::refined::refined_camera;
 use crate::render::views::{Layer, quantised, write_view};
 use crate::scene::{Frame, Scene, Split};
+use crate::semantics::SemanticFields;
+use crate::semantics::layers::FeatureLayers;
 use crate::train::Trained;
 
 /// Layers of the files in `views/`.
 const VIEW_LAYERS: [Layer; 3] = [Layer::Rgb, Layer::Depth, Layer::Stream];
 
-/// Renders `frames` with the streams asked for, into `<stem>.png` and `<stem>.exr` in `out`.
+/// Renders `frames` with the streams, layers and features asked for, into `<stem>.png` and `<stem>.exr` in `out`.
 ///
 /// Returns the number of frames written: fewer than asked for if the observer said stop.
 ///
 /// # Errors
 /// A file cannot be written.
+#[allow(clippy::too_many_arguments)]
 pub fn render_views(
     trained: &Trained,
     config: &Config,
     frames: &[&Frame],
     streams: [bool; 3],
     layers: &[Layer],
+    features: Option<&FeatureLayers>,
     out: &Path,
     observer: &mut dyn Observer,
 ) -> Result<usize, PipelineError> {
@@ -45,7 +49,11 @@ pub fn render_views(
         let image = render(&model, frame, &sampling, 1);
         // Normals follow from the camera that the picture really was taken with.
         let (camera, c2w) = refined_camera(&trained.field, frame);
-        write_view(out, &frame.stem, &image, &camera, &c2w, layers, Vec::new())?;
+        let extra = match features {
+            Some(features) => features.render(&model, frame, &sampling)?.channels(),
+            None => Vec::new(),
+        };
+        write_view(out, &frame.stem, &image, &camera, &c2w, layers, extra)?;
         observer.event(&Event::Views { done: done + 1, total: frames.len() });
     }
     Ok(frames.len())
@@ -60,6 +68,7 @@ pub fn render_views(
 pub fn evaluate(
     scene: &Scene,
     trained: &Trained,
+    fields: Option<&SemanticFields>,
     config: &Config,
     run: &RunFolder,
     mut cost: Cost,
