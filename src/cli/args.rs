@@ -44,6 +44,10 @@ pub enum Command {
     #[command(after_help = "Example:\n  divff render runs/kitchen --split test --layers rgb,depth,stream \
         --out views")]
     Render(RenderArgs),
+    /// Find a phrase in a map: scores at all vertices, and a picture
+    #[command(after_help = "Example:\n  divff query runs/kitchen --text mug --text kettle --out mug\n  \
+        divff query map/persistent.ply --text mug --scene kitchen --out mug")]
+    Query(QueryArgs),
     /// Measure a run against its scene's test frames and ground truth
     #[command(after_help = "Example:\n  divff eval runs/kitchen")]
     Eval(EvalArgs),
@@ -264,6 +268,21 @@ pub struct RenderArgs {
     pub scene: Option<PathBuf>,
 }
 
+/// `divff query`.
+#[derive(Debug, Args)]
+pub struct QueryArgs {
+    /// Folder of a run with a map, or a .ply or .glb file of a map
+    pub path: PathBuf,
+    #[command(flatten)]
+    pub text: TextArgs,
+    /// Folder for the scored map and the pictures
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Scene (or any folder with text/) whose embeddings are used [default: that of the run]
+    #[arg(long, value_name = "SCENE")]
+    pub scene: Option<PathBuf>,
+}
+
 /// `divff eval`.
 #[derive(Debug, Args)]
 pub struct EvalArgs {
@@ -340,6 +359,6 @@ mod tests {
     #[test]
     fn what_does_not_exist_yet_is_not_offered() {
         let names: Vec<String> = Cli::command().get_subcommands().map(|c| c.get_name().to_owned()).collect();
-        assert_eq!(names, ["demo", "synth", "run", "train", "export", "render", "eval", "inspect"]);
+        assert_eq!(names, ["demo", "synth", "run", "train", "export", "render", "query", "eval", "inspect"]);
     }
 }

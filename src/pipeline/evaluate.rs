@@ -7,6 +7,7 @@ use divff_exporters::Manifest;
 
 use super::folder::create_writable;
 use super::metrics::{RunMetrics, peak_rss_mb, skipped_in_training};
+use super::semantics::SemanticEvaluation;
 use super::{Cost, Event, Observer, PipelineError, RunFolder};
 use crate::config::Config;
 use crate::eval::{self, RenderedView};
@@ -79,13 +80,15 @@ pub fn evaluate(
     let model = Model::new(&trained.field, &trained.grids, [true; 3]);
     let sampling = config.train.render_sampling();
     let total = scene.frames.iter().filter(|f| f.split == Split::Test).count();
+    let mut semantic = SemanticEvaluation::new(scene, fields, config)?;
     let mut done = 0;
     let mut quality = eval::evaluate_images(scene, |frame| {
         if observer.stop() {
             return Ok(None);
         }
         let image = render(&model, frame, &sampling, 1);
-        write_view(&run.views(), &frame.stem, &image, &frame.camera, &frame.c2w, &VIEW_LAYERS, Vec::new())?;
+        let extra = semantic.add(&model, frame, &sampling)?;
+        write_view(&run.views(), &frame.stem, &image, &frame.camera, &frame.c2w, &VIEW_LAYERS, extra)?;
         done += 1;
         observer.event(&Event::Views { done, total });
         Ok(Some(measurable(image)))
@@ -93,7 +96,10 @@ pub fn evaluate(
     if observer.stop() {
         return Ok(None);
     }
+    semantic.fill_in(&mut quality, &model, &sampling)?;
     let mut skipped = skipped_in_training(&trained.progress, trained.field.shape.streams);
+    let reasons = fields.map(|f| f.skipped.iter().map(|(what, why)| (what.clone(), why.clone().into())));
+    skipped.insert("features".to_owned(), serde_json::Value::Object(reasons.into_iter().flatten().collect()));
     // Without a manifest the files there are, if any, are not a whole map.
     match Manifest::read(&run.map()) {
         Ok(manifest) => {

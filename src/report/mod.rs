@@ -216,6 +216,14 @@ fn middle(geometry: &Geometry) -> Option<(DVec3, f64)> {
     Some((centre, 0.5 * f64::from((high - low).length()).max(1e-9)))
 }
 
+/// A picture of geometries from above, from far enough to see most of the first; `up` is the axis that points upwards.
+/// `None` where there is nothing to see.
+pub fn overview(all: &[&Geometry], up: DVec3, width: usize, height: usize) -> Option<Picture> {
+    let (centre, radius) = middle(all.first()?)?;
+    let view = Viewpoint::around(centre, radius, direction(up, 35.0), up.as_vec3());
+    Some(rasterise(all, &view, width, height))
+}
+
 /// The files of the map and what is in them; without a manifest the map is not complete.
 fn files(run: &RunFolder) -> Vec<html::FileRow> {
     let Ok(manifest) = Manifest::read(&run.map()) else { return Vec::new() };

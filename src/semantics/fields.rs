@@ -11,7 +11,7 @@ use super::compress::{Compressor, CompressorHeader};
 use super::config::SemanticsConfig;
 use super::error::SemanticsError;
 use super::head::{HeadShape, Heads};
-use super::relevancy::{Queries, RelevancyError};
+use super::relevancy::Queries;
 use super::text_source::TextSource;
 use crate::field::Stream;
 use crate::field::hashgrid::Row;
@@ -87,15 +87,7 @@ impl SpaceField {
         phrases: &[String],
         temperature: f32,
     ) -> Result<Queries, SemanticsError> {
-        let wanted: Vec<Vec<f32>> =
-            phrases.iter().map(|p| text.embedding(self.space, p)).collect::<Result<_, _>>()?;
-        let canonical = text.canonical(self.space);
-        if canonical.is_empty() {
-            return Err(RelevancyError::NoCanonical { space: self.space }.into());
-        }
-        let wanted: Vec<&[f32]> = wanted.iter().map(Vec::as_slice).collect();
-        let canonical: Vec<&[f32]> = canonical.iter().map(Vec::as_slice).collect();
-        Ok(Queries::compressed(self.space, &self.compressor, &wanted, &canonical, temperature)?)
+        text.queries(self.space, &self.compressor, phrases, temperature)
     }
 }
 

@@ -5,6 +5,7 @@
 //! like; `compress` makes the rows short; `head` learns and renders them for every stream; `fields` is what a run keeps
 //! of that; `relevancy` holds points against a phrase without making them long again.
 
+pub mod agreement;
 pub mod bake;
 pub mod compress;
 pub mod config;
@@ -12,6 +13,7 @@ pub mod error;
 pub mod fields;
 pub mod head;
 pub mod layers;
+pub mod overlay;
 pub mod relevancy;
 pub mod targets;
 pub mod text_source;

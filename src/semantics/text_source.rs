@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
+use super::compress::Compressor;
 use super::error::SemanticsError;
+use super::relevancy::Queries;
 use crate::scene::Scene;
 use crate::scene::features::{FeatureStore, Space, TextTable, read_embeddings};
 
@@ -14,7 +16,16 @@ pub struct TextSource {
 }
 
 impl TextSource {
-    /// What comes with a scene.
+    /// What `text/` in a folder holds.
+    ///
+    /// # Errors
+    /// A file of embeddings that is damaged.
+    pub fn of_folder(root: &Path) -> Result<Self, SemanticsError> {
+        let [clip, egovideo] = Space::ALL.map(|space| TextTable::read(root, space));
+        Ok(Self { tables: [clip?, egovideo?], given: Vec::new() })
+    }
+
+    /// As [`Self::of_folder`], checked against the scene's features.
     ///
     /// # Errors
     /// A file of embeddings that is damaged or does not fit the features.
@@ -46,6 +57,26 @@ impl TextSource {
     pub fn embedding(&self, space: Space, phrase: &str) -> Result<Vec<f32>, SemanticsError> {
         self.known(space, phrase)
             .ok_or_else(|| SemanticsError::Phrase { phrase: phrase.to_owned(), space })
+    }
+
+    /// Phrases ready to be held against features that `compressor` made short.
+    ///
+    /// # Errors
+    /// [`SemanticsError::Phrase`] where no source knows a phrase, [`SemanticsError::Relevancy`] for embeddings that do
+    /// not fit, or if no canonical phrase is known.
+    pub fn queries(
+        &self,
+        space: Space,
+        compressor: &Compressor,
+        phrases: &[String],
+        temperature: f32,
+    ) -> Result<Queries, SemanticsError> {
+        let wanted: Vec<Vec<f32>> =
+            phrases.iter().map(|p| self.embedding(space, p)).collect::<Result<_, _>>()?;
+        let canonical = self.canonical(space);
+        let wanted: Vec<&[f32]> = wanted.iter().map(Vec::as_slice).collect();
+        let canonical: Vec<&[f32]> = canonical.iter().map(Vec::as_slice).collect();
+        Ok(Queries::compressed(space, compressor, &wanted, &canonical, temperature)?)
     }
 
     /// Embeddings of the canonical phrases that are known.

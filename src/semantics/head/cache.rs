@@ -68,6 +68,16 @@ impl Sources {
         all
     }
 
+    /// Rays whose samples have the given weights, streams and positions.
+    #[cfg(test)]
+    pub(super) fn of_rays(rays: Vec<Vec<(f32, u8, Vec3)>>) -> Self {
+        let mut all = Self { first: vec![0], ..Self::default() };
+        for mut found in rays {
+            all.add(1.0, &mut found, usize::MAX);
+        }
+        all
+    }
+
     /// Number of rays.
     pub fn len(&self) -> usize {
         self.opacity.len()
