@@ -229,7 +229,12 @@ pub fn summary(metrics: &RunMetrics) -> String {
         q.depth_median_abs_m.map(|v| format!("depth off by {v:.3} (median)")),
         q.stream_miou.map(|v| format!("stream mIoU {v:.3}")),
     ];
+    let phrases = [
+        q.object_miou.map(|v| format!("objects mIoU {v:.3}")),
+        q.affordance_miou.map(|v| format!("affordances mIoU {v:.3}")),
+    ];
     line("pictures", &pictures);
+    line("phrases", &phrases);
     for (name, surface) in [("surface", &q.persistent), ("dynamic", &q.dynamic), ("actor", &q.actor)] {
         let surface = surface.as_ref();
         line(

@@ -60,6 +60,24 @@ impl PhraseTruth {
     }
 }
 
+impl PhraseTruth {
+    /// Where the truth says that a phrase is in a frame; `None` where it says nothing about the frame.
+    ///
+    /// # Errors
+    /// Truth that cannot be read, or of another size than the frame.
+    pub fn mask(&self, frame: &Frame, space: Space, phrase: &str) -> Result<Option<Vec<bool>>, EvalError> {
+        let name = format!("{}.png", frame.stem);
+        if space == Space::Clip {
+            let of: Vec<u32> = self.objects.iter().filter(|o| o.1 == phrase).map(|o| o.0).collect();
+            let instances = labels(&self.root.join("instances").join(&name), frame)?;
+            return Ok(instances.map(|labels| labels.iter().map(|l| of.contains(l)).collect()));
+        }
+        let Some((_, folder)) = self.affordances.iter().find(|a| a.0 == phrase) else { return Ok(None) };
+        let mask = labels(&self.root.join("affordances").join(folder).join(&name), frame)?;
+        Ok(mask.map(|labels| labels.iter().map(|l| *l > 127).collect()))
+    }
+}
+
 const OBJECTS: &str = "an object of {name, query, stream, moves} by instance number";
 const AFFORDANCES: &str = "a list of phrases or of {phrase, slug}";
 

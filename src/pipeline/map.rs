@@ -36,7 +36,7 @@ pub fn export_map(
     observer.event(&Event::Stage(Stage::Mapping));
     let start = Instant::now();
     let mut map = map::build(scene, trained, config, &mut |p| observer.event(&Event::Mapping(p)))?;
-    if let Some(fields) = fields.filter(|f| !f.is_empty()) {
+    if let Some(fields) = fields {
         annotate(&mut map, scene, trained, fields, &config.semantics)?;
     }
     cost.extract_seconds = Some(start.elapsed().as_secs_f64());

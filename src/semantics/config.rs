@@ -35,6 +35,9 @@ pub struct SemanticsConfig {
     pub image: ImageTargetConfig,
     /// What the video-language field is trained on.
     pub video: VideoTargetConfig,
+    /// Rays whose mean is held against the descriptor of a patch, or of the clip in its hotspot: it describes them
+    /// together. 0: every ray by itself, as in the paper.
+    pub pooled_rays: usize,
     /// Weight of the part features that regularise the video-language field; 0: none.
     pub part_weight: f32,
     /// Numbers per compressed part feature.
@@ -90,6 +93,7 @@ impl Default for SemanticsConfig {
             enabled: true,
             image: ImageTargetConfig::default(),
             video: VideoTargetConfig::default(),
+            pooled_rays: 64,
             part_weight: 0.1,
             part_dim: 16,
             // What is beyond the first components of descriptors of single masks is mostly noise, which views average
@@ -103,7 +107,7 @@ impl Default for SemanticsConfig {
             layers: 1,
             steps: 1500,
             rays: 4096,
-            cached_rays: 600_000,
+            cached_rays: 800_000,
             samples: 8,
             table_rate: 1e-2,
             network_rate: 2e-3,
@@ -128,6 +132,8 @@ impl SemanticsConfig {
         range("semantics.temperature", t.to_string(), t > 0.0 && t <= 1e6, "must be above 0 and up to 1e6")?;
         let p = self.part_weight;
         range("semantics.part_weight", p.to_string(), (0.0..=100.0).contains(&p), "must be 0 to 100")?;
+        let n = self.pooled_rays;
+        range("semantics.pooled_rays", n.to_string(), n <= 4096, "must be 0 to 4096")?;
         let d = self.part_dim;
         range("semantics.part_dim", d.to_string(), (1..=512).contains(&d), "must be 1 to 512")?;
         let b = self.image.box_weight;

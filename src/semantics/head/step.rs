@@ -1,6 +1,7 @@
 //! One training step of the fields of a space at frozen geometry.
 //!
-//! The loss of a ray is W |Σ w f − z|² over the descriptor and, with weights of its own, over the part feature. As in
+//! The loss of a ray is W |Σ w f − z|² over the descriptor and, with weights of its own, over the part feature. Where a
+//! descriptor tells of many rays together, as that of a patch does, it is |mean (Σ w f) − z|² over rays of the bag. As in
 //! the training of geometry, a fixed number of groups have a gradient each, and every table is updated by one task
 //! that walks the groups in order: the result does not depend on the number of threads.
 
@@ -35,6 +36,59 @@ pub struct RayTargets {
     pub usable: Vec<u32>,
     /// Time of each ray.
     pub times: Vec<f32>,
+    /// Rays that share a descriptor; if there are any, steps choose among them and not among `usable`.
+    pub bags: Bags,
+}
+
+/// Rays that one descriptor describes together: those of a patch, or of a hotspot.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Bags {
+    /// Bag `n` has the rays `members[first[n]..first[n + 1]]`, at least one.
+    pub first: Vec<u32>,
+    /// Rays.
+    pub members: Vec<u32>,
+    /// `[bags, dim]`.
+    pub values: Vec<half::f16>,
+}
+
+impl Bags {
+    /// Adds a bag; one without rays is left out.
+    pub fn push(&mut self, rays: impl IntoIterator<Item = u32>, value: &[f32]) {
+        if self.first.is_empty() {
+            self.first.push(0);
+        }
+        let before = self.members.len();
+        self.members.extend(rays);
+        if self.members.len() > before {
+            self.first.push(self.members.len() as u32);
+            self.values.extend(value.iter().map(|v| half::f16::from_f32(*v)));
+        }
+    }
+
+    /// Number of bags.
+    pub fn len(&self) -> usize {
+        self.first.len().saturating_sub(1)
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// These bags with the rays that `keep` says; `dim` numbers a descriptor.
+    pub fn only(&self, dim: usize, keep: impl Fn(&u32) -> bool) -> Self {
+        let mut kept = Self::default();
+        for n in 0..self.len() {
+            let value: Vec<f32> = self.values[n * dim..][..dim].iter().map(|v| v.to_f32()).collect();
+            kept.push(self.of(n).iter().copied().filter(&keep), &value);
+        }
+        kept
+    }
+
+    /// Rays of bag `n`.
+    pub fn of(&self, n: usize) -> &[u32] {
+        &self.members[self.first[n] as usize..self.first[n + 1] as usize]
+    }
 }
 
 /// What a step is told.
@@ -44,6 +98,8 @@ pub struct HeadStep {
     pub step: u64,
     /// Rays; rounded up to whole groups.
     pub rays: usize,
+    /// Rays of a bag that are rendered.
+    pub bag: usize,
     /// Learning rate of the tables.
     pub table_rate: f32,
     /// Learning rate of the networks.
@@ -65,6 +121,8 @@ pub struct HeadOptimiser {
 #[derive(Default)]
 pub(super) struct Group {
     rays: Vec<u32>,
+    /// Bags that the rays are of, each with as many rays; empty if each ray is by itself.
+    bags: Vec<u32>,
     batches: [StreamBatch; 3],
     /// Share of each lane in its ray.
     shares: [Vec<f32>; 3],
@@ -89,16 +147,14 @@ impl HeadOptimiser {
 
     /// Runs one step; the mean loss of its rays.
     pub fn step(&mut self, heads: &mut Heads, sources: &Sources, targets: &RayTargets, plan: &HeadStep) -> f64 {
-        let per_group = plan.rays.div_ceil(GROUPS);
+        let bags = if targets.bags.is_empty() { 0 } else { (plan.rays / plan.bag.max(1)).div_ceil(GROUPS).max(1) };
+        let per_group = if bags > 0 { bags * plan.bag.max(1) } else { plan.rays.div_ceil(GROUPS) };
         let count = (per_group * GROUPS) as f32;
         let model = HeadModel::new(heads, plan.precision);
         let arch = pulp::Arch::new();
         self.groups.par_iter_mut().enumerate().for_each(|(n, group)| {
             let mut rng = Rng::new(plan.seed, plan.step, n as u64);
-            group.rays.clear();
-            group.rays.extend((0..per_group).map(|_| targets.usable[rng.below(targets.usable.len())]));
-            // Neighbours in the cache are neighbours in a picture, and share table rows.
-            group.rays.sort_unstable();
+            group.choose(&mut rng, targets, per_group, bags);
             arch.dispatch(GroupPass { group, model: &model, sources, targets, count });
         });
         drop(model);
@@ -155,10 +211,29 @@ impl WithSimd for GroupPass<'_> {
 }
 
 impl Group {
-    /// A group of the given rays.
+    /// A group of the given rays, or bags of rays.
     #[cfg(test)]
-    pub(super) fn of(rays: Vec<u32>) -> Self {
-        Self { rays, ..Self::default() }
+    pub(super) fn of(rays: Vec<u32>, bags: Vec<u32>) -> Self {
+        Self { rays, bags, ..Self::default() }
+    }
+
+    /// Chooses `count` rays, or as many of `bags` bags.
+    fn choose(&mut self, rng: &mut Rng, targets: &RayTargets, count: usize, bags: usize) {
+        let Self { rays, bags: chosen, .. } = self;
+        rays.clear();
+        chosen.clear();
+        if bags == 0 {
+            rays.extend((0..count).map(|_| targets.usable[rng.below(targets.usable.len())]));
+            // Neighbours in the cache are neighbours in a picture, and share table rows.
+            rays.sort_unstable();
+            return;
+        }
+        for _ in 0..bags {
+            let bag = rng.below(targets.bags.len());
+            let members = targets.bags.of(bag);
+            chosen.push(bag as u32);
+            rays.extend((0..count / bags).map(|_| members[rng.below(members.len())]));
+        }
     }
 
     /// Gradient of lane by lane encodings, after [`GroupPass`]: positions and rows of stream `s`.
@@ -205,6 +280,7 @@ impl Group {
     fn compare(&mut self, targets: &RayTargets, count: f32) {
         let (width, dim) = (targets.width, targets.dim);
         self.loss = 0.0;
+        let off = self.off_bags(targets);
         for (ray, rendered) in self.rays.iter().zip(self.rendered.chunks_exact_mut(width)) {
             let ray = *ray as usize;
             let target = &targets.values[ray * width..][..width];
@@ -217,6 +293,29 @@ impl Group {
             }
             self.loss += f64::from(loss);
         }
+        let Some(per_bag) = self.rays.len().checked_div(self.bags.len()) else { return };
+        for (off, rays) in off.chunks_exact(dim).zip(self.rendered.chunks_exact_mut(per_bag * width)) {
+            self.loss += per_bag as f64 * off.iter().map(|v| f64::from(v * v)).sum::<f64>();
+            for rendered in rays.chunks_exact_mut(width) {
+                rendered.iter_mut().zip(off).for_each(|(r, off)| *r += 2.0 * off / count);
+            }
+        }
+    }
+
+    /// Mean of what was rendered for the rays of each bag, minus what it should be: `[bags, dim]`.
+    fn off_bags(&self, targets: &RayTargets) -> Vec<f32> {
+        let (width, dim) = (targets.width, targets.dim);
+        let Some(per_bag) = self.rays.len().checked_div(self.bags.len()) else { return Vec::new() };
+        let mut off = vec![0.0; self.bags.len() * dim];
+        let rays = self.rendered.chunks_exact(per_bag * width);
+        for ((off, bag), rays) in off.chunks_exact_mut(dim).zip(&self.bags).zip(rays) {
+            for rendered in rays.chunks_exact(width) {
+                off.iter_mut().zip(rendered).for_each(|(o, r)| *o += r / per_bag as f32);
+            }
+            let wanted = &targets.bags.values[*bag as usize * dim..][..dim];
+            off.iter_mut().zip(wanted).for_each(|(o, w)| *o -= w.to_f32());
+        }
+        off
     }
 
     #[inline(always)]
@@ -226,7 +325,7 @@ impl Group {
         for (s, batch) in batches.iter_mut().enumerate() {
             gradient[s].clear();
             gradient[s].resize(model.heads.weights[s].len(), 0.0);
-            let Some((net, packed)) = model.net(s) else { continue };
+            let Some((net, packed)) = model.net(s).filter(|_| !batch.is_empty()) else { continue };
             let StreamBatch { sample, levels, .. } = batch;
             let activations = &mut activations[s];
             for (n, (rays, shares)) in sample.chunks(TILE).zip(shares[s].chunks(TILE)).enumerate() {

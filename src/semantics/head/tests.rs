@@ -4,7 +4,7 @@ use glam::Vec3;
 use half::f16;
 
 use super::cache::Sources;
-use super::step::{Group, GroupPass, HeadOptimiser, HeadStep, RayTargets};
+use super::step::{Bags, Group, GroupPass, HeadOptimiser, HeadStep, RayTargets};
 use super::*;
 use crate::field::hashgrid::{AXES, Points, TIME};
 use crate::semantics::config::SemanticsConfig;
@@ -59,12 +59,17 @@ fn random_rays(count: usize, seed: u64) -> (Sources, RayTargets) {
         targets.times.push(rng.uniform());
         targets.usable.push(n as u32);
     }
+    // Every ray is in one bag of twelve, beside what it should be by itself.
+    for first in (0..count as u32).step_by(12) {
+        let value: Vec<f32> = (0..dim).map(|_| rng.uniform() - 0.5).collect();
+        targets.bags.push(first..(first + 12).min(count as u32), &value);
+    }
     (Sources::of_rays(rays), targets)
 }
 
 /// The loss of all rays in f64; `share` is how much each source counts.
 fn reference(heads: &Heads, sources: &Sources, targets: &RayTargets, share: impl Fn(f32) -> f64) -> f64 {
-    let mut loss = 0.0;
+    let (mut loss, mut all) = (0.0, Vec::new());
     for ray in 0..sources.len() {
         let mut rendered = vec![0.0; targets.width];
         for source in sources.of(ray) {
@@ -75,6 +80,15 @@ fn reference(heads: &Heads, sources: &Sources, targets: &RayTargets, share: impl
         for (k, r) in rendered.iter().enumerate() {
             let off = r - f64::from(targets.values[ray * targets.width + k].to_f32());
             loss += f64::from(targets.weights[ray][usize::from(k >= targets.dim)]) * off * off;
+        }
+        all.push(rendered);
+    }
+    for bag in 0..targets.bags.len() {
+        let rays = targets.bags.of(bag);
+        for k in 0..targets.dim {
+            let mean = rays.iter().map(|r| all[*r as usize][k]).sum::<f64>() / rays.len() as f64;
+            let off = mean - f64::from(targets.bags.values[bag * targets.dim + k].to_f32());
+            loss += rays.len() as f64 * off * off;
         }
     }
     loss / sources.len() as f64
@@ -112,7 +126,8 @@ fn evaluate(heads: &Heads, s: usize, p: Vec3, time: f32) -> Vec<f64> {
 /// Analytic gradients of all networks, and of the tables.
 fn gradients(heads: &Heads, sources: &Sources, targets: &RayTargets) -> ([Vec<f32>; 3], [Vec<Vec<Row>>; 3]) {
     let model = HeadModel::new(heads, Precision::F32);
-    let mut group = Group::of(targets.usable.clone());
+    let bags = (0..targets.bags.len() as u32).collect();
+    let mut group = Group::of(targets.usable.clone(), bags);
     let count = sources.len() as f32;
     pulp::Arch::new().dispatch(GroupPass { group: &mut group, model: &model, sources, targets, count });
     let tables = std::array::from_fn(|s| {
@@ -134,7 +149,7 @@ fn gradients(heads: &Heads, sources: &Sources, targets: &RayTargets) -> ([Vec<f3
 fn worst(share: impl Fn(f32) -> f64 + Copy) -> f64 {
     const H: f32 = 2e-3;
     let heads = random_heads(3);
-    let (sources, targets) = random_rays(60, 5);
+    let (sources, targets) = random_rays(60, 5); // five bags
     let (networks, tables) = gradients(&heads, &sources, &targets);
     let loss = |heads: &Heads| reference(heads, &sources, &targets, share);
     let mut worst = 0.0f64;
@@ -177,7 +192,7 @@ fn the_comparison_of_gradients_notices_a_wrong_weight() {
 }
 
 fn plan(step: u64) -> HeadStep {
-    HeadStep { step, rays: 64, table_rate: 1e-2, network_rate: 5e-3, precision: Precision::F32, seed: 9 }
+    HeadStep { step, rays: 64, bag: 4, table_rate: 1e-2, network_rate: 5e-3, precision: Precision::F32, seed: 9 }
 }
 
 fn trained(threads: usize, steps: u64) -> (Heads, f64) {
@@ -235,6 +250,41 @@ fn what_moves_is_learned_where_it_is_at_each_time() {
     let model = HeadModel::new(&heads, Precision::F32);
     model.features(Stream::Dynamic, &[place], 0.1, &mut nothing);
     assert_eq!(nothing, [0.0; 4], "a stream that is not there has no feature");
+}
+
+#[test]
+fn descriptors_of_mixtures_are_taken_apart() {
+    // Two things that are never seen alone: three bags tell how much of each is in them, and what the mixture is.
+    let shape = HeadShape { dim: 4, parts: 0, ..shape() };
+    let places = [Vec3::new(0.2, 0.2, 0.2), Vec3::new(0.8, 0.5, 0.4)];
+    let rays = (0..8).map(|n| vec![(1.0, Stream::Persistent as u8, places[n / 4])]).collect();
+    let mut bags = Bags::default();
+    for (first, last) in [(0u32, 6u32), (2, 8), (1, 7)] {
+        // Rays 0 to 3 see the first thing (1), the others the second (-1).
+        let mean = (first..last).map(|n| if n < 4 { 1.0 } else { -1.0 }).sum::<f32>() / (last - first) as f32;
+        bags.push(first..last, &[mean, 0.0, 0.0, 0.0]);
+    }
+    let targets = RayTargets {
+        width: 4,
+        dim: 4,
+        values: vec![f16::ZERO; 8 * 4],
+        weights: vec![[0.0; 2]; 8],
+        usable: (0..8).collect(),
+        times: vec![0.5; 8],
+        bags,
+    };
+    let sources = Sources::of_rays(rays);
+    let mut heads = Heads::zeros(shape);
+    heads.init(2);
+    let mut optimiser = HeadOptimiser::new(&heads);
+    for step in 1..=400 {
+        let plan = HeadStep { rays: 1024, bag: 64, ..plan(step) };
+        optimiser.step(&mut heads, &sources, &targets, &plan);
+    }
+    let model = HeadModel::new(&heads, Precision::F32);
+    let mut out = vec![0.0; 8];
+    model.features(Stream::Persistent, &places, 0.5, &mut out);
+    assert!(out[0] > 0.75 && out[4] < -0.75, "{} {}", out[0], out[4]);
 }
 
 fn shape_of(heads: &Heads) -> HeadShape {

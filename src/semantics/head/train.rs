@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::cache::Sources;
 use super::render::pixel_ray;
-use super::step::{HeadOptimiser, HeadStep, RayTargets};
+use super::step::{Bags, HeadOptimiser, HeadStep, RayTargets};
 use super::{HeadShape, Heads};
 use crate::config::Config;
 use crate::field::mlp::Precision;
@@ -24,6 +24,9 @@ use crate::train::Trained;
 /// Streams of random numbers: which pixels are kept, and the steps of each space.
 const PIXEL_STREAM: u64 = 0x7069_7865;
 const SPACE_SEED: u64 = 0x7370_6163;
+
+/// Every so many pixels along rows and columns are looked at to tell how many have targets.
+const SAMPLED: usize = 8;
 
 /// Steps over which the learning rates rise to their full size.
 const WARM_UP: f32 = 50.0;
@@ -142,14 +145,14 @@ fn choose_pixels(
     seed: u64,
 ) -> Result<Vec<Pixel>, SemanticsError> {
     let with = targets.frames();
-    let squares = |side: u32| -> usize {
-        let of = |n: &usize| {
-            let c = &frames[*n].camera;
-            c.width.div_ceil(side) as usize * c.height.div_ceil(side) as usize
-        };
-        with.iter().map(of).sum()
+    // Some frames have targets in a corner only: what counts is how many pixels have one, by a sample of them.
+    let sampled = |n: &usize| {
+        let c = &frames[*n].camera;
+        let lattice = (0..c.height).step_by(SAMPLED).flat_map(|y| (0..c.width).step_by(SAMPLED).map(move |x| (x, y)));
+        lattice.filter(|(x, y)| targets.any(&Pixel { frame: *n as u32, x: *x, y: *y })).count()
     };
-    let side = (1..64).find(|side| squares(*side) <= settings.cached_rays).unwrap_or(64);
+    let with_target = with.par_iter().map(sampled).sum::<usize>() * SAMPLED * SAMPLED;
+    let side = (1..64u32).find(|side| with_target / (side * side) as usize <= settings.cached_rays).unwrap_or(64);
     let chosen: Vec<Result<Vec<Pixel>, SemanticsError>> = with
         .par_iter()
         .map(|n| {
@@ -252,7 +255,7 @@ impl SpaceTrainer {
         let of = |p: &Pixel| {
             let frame = p.frame as usize;
             let found = video.at(frame, p.x, p.y);
-            let (mut z, mut count) = (vec![0.0; dim + part_dim], 0.0);
+            let (mut z, mut count) = (vec![0.0; dim + part_dim], 0.0f32);
             if let Some(blend) = &found.patch {
                 encoded.blend(blend, &mut z[..dim]);
                 count += 1.0;
@@ -264,15 +267,24 @@ impl SpaceTrainer {
             if count == 0.0 {
                 return None;
             }
+            if settings.pooled_rays > 0 {
+                // Descriptors are held against bags of rays.
+                z[..dim].fill(0.0);
+                count = 0.0;
+            }
             // |f − a|² + |f − b|² = 2 |f − (a + b)/2|² and a constant.
-            z[..dim].iter_mut().for_each(|v| *v /= count);
+            z[..dim].iter_mut().for_each(|v| *v /= count.max(1.0));
             let part = parts.as_ref().and_then(|(t, e)| Some(e.row(t.at(frame, p.x, p.y)?)));
             if let Some(part) = part {
                 z[dim..].copy_from_slice(part);
             }
             Some((z, [count, if part.is_some() { settings.part_weight } else { 0.0 }]))
         };
-        let targets = gather(pixels, frames, dim + part_dim, dim, of);
+        let mut targets = gather(pixels, frames, dim + part_dim, dim, of);
+        if settings.pooled_rays > 0 {
+            targets.bags = bags(video, &encoded, pixels);
+            targets.usable = targets.bags.members.clone();
+        }
         let frames = video.frames().count();
         Ok((!targets.usable.is_empty()).then_some(Self { compressor, targets, parts: part_dim, frames }))
     }
@@ -288,7 +300,9 @@ impl SpaceTrainer {
     ) -> Option<(Heads, Compressor)> {
         const REPORT_EVERY: u64 = 50;
         let Self { compressor, mut targets, parts, frames } = self;
-        targets.usable.retain(|n| !sources.of(*n as usize).is_empty());
+        let seen = |n: &u32| !sources.of(*n as usize).is_empty();
+        targets.usable.retain(seen);
+        targets.bags = targets.bags.only(targets.dim, seen);
         let settings = &config.semantics;
         let shape = HeadShape::new(settings, &trained.field.shape, frames, compressor.dim(), parts);
         let mut heads = Heads::zeros(shape);
@@ -318,11 +332,35 @@ fn plan(settings: &SemanticsConfig, config: &Config, step: u64, space: Space) ->
     HeadStep {
         step,
         rays: settings.rays,
+        bag: settings.pooled_rays,
         table_rate: settings.table_rate * rate,
         network_rate: settings.network_rate * rate,
         precision: Precision::Auto,
         seed: config.seed ^ (SPACE_SEED + space as u64),
     }
+}
+
+/// The rays of each patch, and of the clip's hotspot in each frame, with their descriptors.
+fn bags(video: &VideoTargets, encoded: &EncodedTable, pixels: &[Pixel]) -> Bags {
+    let mut bags = Bags::default();
+    let mut first = 0u32;
+    for of_frame in pixels.chunk_by(|a, b| a.frame == b.frame) {
+        let frame = of_frame[0].frame as usize;
+        let numbered = || (first..).zip(of_frame);
+        for ([left, top, right, bottom], row) in video.patches(frame) {
+            let inside = |p: &Pixel| {
+                let (x, y) = (f64::from(p.x) + 0.5, f64::from(p.y) + 0.5);
+                (left..right).contains(&x) && (top..bottom).contains(&y)
+            };
+            bags.push(numbered().filter(|(_, p)| inside(p)).map(|(n, _)| n), encoded.row(row));
+        }
+        let clip = |p: &Pixel| video.at(frame, p.x, p.y).clip;
+        if let Some(row) = of_frame.iter().find_map(clip) {
+            bags.push(numbered().filter(|(_, p)| clip(p).is_some()).map(|(n, _)| n), encoded.row(row));
+        }
+        first += of_frame.len() as u32;
+    }
+    bags
 }
 
 /// The targets of all pixels as one table.
@@ -345,6 +383,6 @@ fn gather(
         .collect();
     let usable = (0..pixels.len() as u32).filter(|n| weights[*n as usize][0] > 0.0).collect();
     let times = pixels.iter().map(|p| frames[p.frame as usize].time as f32).collect();
-    RayTargets { width, dim, values, weights, usable, times }
+    RayTargets { width, dim, values, weights, usable, times, bags: Bags::default() }
 }
 
