@@ -16,8 +16,8 @@ use divff::semantics::relevancy::{Points, Queries};
 use divff::semantics::{SemanticFields, SemanticsError, TextSource, slug};
 use divff_exporters::npz::read_npz_matrices;
 use divff_exporters::{
-    Attribute, AttributeValues, Geometry, GlbOptions, Manifest, PlyOptions, UpAxis, read_glb, read_ply, write_glb,
-    write_ply,
+    Attribute, AttributeValues, Geometry, GlbOptions, Manifest, PlyOptions, UpAxis, read_glb, read_ply,
+    write_glb, write_ply,
 };
 use glam::DVec3;
 
@@ -150,8 +150,9 @@ fn asked(path: &Path) -> Result<Asked, CliError> {
         "glb" if path.is_file() => Ok(Asked { geometries: read_glb(path)?.geometries, glb: true, folder }),
         _ if path.is_dir() => {
             let folder = RunFolder::open(path)?.map();
-            let manifest = Manifest::read(&folder)
-                .map_err(|_| bad("has no complete map".into(), "make one with `divff export` or `divff run`"))?;
+            let manifest = Manifest::read(&folder).map_err(|_| {
+                bad("has no complete map".into(), "make one with `divff export` or `divff run`")
+            })?;
             let named = |stream: &str| {
                 manifest.files.iter().map(|f| &f.path).find(|p| p.starts_with(stream) && p.ends_with(".ply"))
             };
@@ -256,12 +257,14 @@ fn answer(
         let path = out.join(format!("{name}.png"));
         let pixels = picture.rgba.as_flattened();
         let (width, height) = (picture.width as u32, picture.height as u32);
-        image::save_buffer(&path, pixels, width, height, image::ExtendedColorType::Rgba8).map_err(|e| {
-            CliError::Input { path, what: e.to_string(), remedy: "choose another --out" }
-        })?;
+        image::save_buffer(&path, pixels, width, height, image::ExtendedColorType::Rgba8)
+            .map_err(|e| CliError::Input { path, what: e.to_string(), remedy: "choose another --out" })?;
     }
     Ok(match count {
         0 => format!("{phrase}: nothing is closer to it than to a canonical phrase (best score {best:.2})"),
-        n => format!("{phrase}: {n} vertices, best score {best:.2} at ({:.2}, {:.2}, {:.2})", place.x, place.y, place.z),
+        n => format!(
+            "{phrase}: {n} vertices, best score {best:.2} at ({:.2}, {:.2}, {:.2})",
+            place.x, place.y, place.z
+        ),
     })
 }

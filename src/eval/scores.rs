@@ -139,9 +139,8 @@ impl ScoreSums {
         frame: &Frame,
         scores: &[(Space, String, Vec<f32>)],
     ) -> Result<(), EvalError> {
-        let of = |space: Space, phrase: &str| {
-            scores.iter().find(|s| s.0 == space && s.1 == phrase).map(|s| &s.2)
-        };
+        let of =
+            |space: Space, phrase: &str| scores.iter().find(|s| s.0 == space && s.1 == phrase).map(|s| &s.2);
         let name = format!("{}.png", frame.stem);
         if let Some(instances) = labels(&truth.root.join("instances").join(&name), frame)? {
             for (number, phrase) in &truth.objects {
@@ -181,7 +180,8 @@ impl ScoreSums {
             [("object_miou", objects), ("affordance_miou", affordances)].into_iter().zip(why)
         {
             if value.is_none() {
-                let why = why.unwrap_or_else(|| "no true mask of a phrase covers 50 px in a test frame".into());
+                let why =
+                    why.unwrap_or_else(|| "no true mask of a phrase covers 50 px in a test frame".into());
                 metrics.absent.insert(name.into(), why);
             }
         }
@@ -235,7 +235,17 @@ mod tests {
         std::fs::create_dir_all(folder.path().join("instances")).unwrap();
         let f = frame(20, 10);
         // Object 3 covers 60 pixels, object 4 only 40.
-        let labels: Vec<u8> = (0..200).map(|n| if n < 60 { 3 } else if n < 100 { 4 } else { 0 }).collect();
+        let labels: Vec<u8> = (0..200)
+            .map(|n| {
+                if n < 60 {
+                    3
+                } else if n < 100 {
+                    4
+                } else {
+                    0
+                }
+            })
+            .collect();
         let image = image::GrayImage::from_raw(20, 10, labels).unwrap();
         image.save(folder.path().join("instances").join(format!("{}.png", f.stem))).unwrap();
         let truth = PhraseTruth {

@@ -92,9 +92,10 @@ impl<'a> SemanticEvaluation<'a> {
                 _ if asked.is_empty() => Some("the scene has no truth for it".to_owned()),
                 None => Some("the run has no features".to_owned()),
                 Some(Err(error)) => Some(error.to_string()),
-                Some(Ok(_)) if phrases.is_empty() || text.canonical(space).is_empty() => {
-                    Some(format!("the scene has no embeddings of its phrases, or none of {:?}", space.canonical_phrases()))
-                }
+                Some(Ok(_)) if phrases.is_empty() || text.canonical(space).is_empty() => Some(format!(
+                    "the scene has no embeddings of its phrases, or none of {:?}",
+                    space.canonical_phrases()
+                )),
                 Some(Ok(_)) => None,
             };
             if let (None, Some(fields)) = (&reason, fields) {
@@ -139,9 +140,9 @@ impl<'a> SemanticEvaluation<'a> {
             }
             match found {
                 Some((_, Split::Test)) => None,
-                Some((_, Split::Train)) => {
-                    metrics.absent.insert(name, "no test frame has features; measured on training frames".into())
-                }
+                Some((_, Split::Train)) => metrics
+                    .absent
+                    .insert(name, "no test frame has features; measured on training frames".into()),
                 None => metrics.absent.insert(name, "no frame has features of this space".into()),
             };
         }

@@ -127,7 +127,11 @@ pub fn coloured_by(geometry: &Geometry, name: &str) -> Option<Geometry> {
 pub fn features_of(geometry: &Geometry) -> Vec<(&'static str, String)> {
     let kinds = [("clip_pca", "image-language features"), ("egovideo_pca", "video-language features")];
     let there = |k: &&(&str, &str)| geometry.features.iter().any(|f| f.name == k.0);
-    kinds.iter().filter(there).map(|(name, what)| (*name, format!("{what}, first three components"))).collect()
+    kinds
+        .iter()
+        .filter(there)
+        .map(|(name, what)| (*name, format!("{what}, first three components")))
+        .collect()
 }
 
 #[cfg(test)]

@@ -151,8 +151,7 @@ fn meshes(run: &RunFolder, scene: &Scene) -> Result<Vec<Figure>, ReportError> {
         }
         for (name, caption) in features::features_of(all[0]) {
             let view = Viewpoint::around(centre, radius, direction(up, 35.0), up.as_vec3());
-            let coloured: Vec<Geometry> =
-                all.iter().filter_map(|g| features::coloured_by(g, name)).collect();
+            let coloured: Vec<Geometry> = all.iter().filter_map(|g| features::coloured_by(g, name)).collect();
             figures.push(mesh_figure(&coloured.iter().collect::<Vec<_>>(), &view, caption)?);
         }
     }

@@ -74,8 +74,7 @@ pub fn annotate(
         let moving = streams.partition_point(|s| *s == Stream::Persistent as u8);
         let points = place.points(&map.points, Stream::Persistent, None);
         let time = frame.map_or(0.0, |f| f.time as f32);
-        let parts =
-            [(Stream::Persistent, 0.0, 0..moving), (Stream::Dynamic, time, moving..points.len())];
+        let parts = [(Stream::Persistent, 0.0, 0..moving), (Stream::Dynamic, time, moving..points.len())];
         let features = columns.features(&parts, &points);
         columns.add(&mut map.points, features)?;
     }
@@ -95,7 +94,8 @@ impl<'a> Columns<'a> {
         let kind = if space == Space::Clip { "relevancy" } else { "affordance" };
         let names: Vec<String> = phrases.iter().map(|p| format!("{kind}_{}", slug(p))).collect();
         let mut skip = |why: &str| {
-            map.skipped.push(Skipped { what: format!("scores of {} phrases", space.name()), why: why.into() });
+            map.skipped
+                .push(Skipped { what: format!("scores of {} phrases", space.name()), why: why.into() });
         };
         let queries = if phrases.is_empty() {
             skip("no embeddings come with the scene");

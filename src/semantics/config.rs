@@ -19,7 +19,7 @@ pub struct HeadStreamConfig {
     pub finest: f32,
     /// At most 2^this rows a level.
     pub log2_rows: u32,
-    /// Lattices over two axes of space and time, for each pair of axes (dynamic) or for the image (actor).
+    /// Lattices over space and time (dynamic, actor).
     pub time_levels: usize,
     /// Cells along the longest side of the box at the finest of them.
     pub time_finest: f32,
@@ -83,9 +83,8 @@ impl Default for SemanticsConfig {
         let dynamic = HeadStreamConfig {
             levels: 3,
             finest: 48.0,
-            log2_rows: 15,
             time_levels: 2,
-            time_finest: 48.0,
+            time_finest: 32.0,
             ..persistent.clone()
         };
         let actor = HeadStreamConfig { finest: 24.0, time_finest: 24.0, ..dynamic.clone() };
@@ -127,7 +126,8 @@ impl SemanticsConfig {
     /// # Errors
     /// The first setting that is out of range.
     pub fn check(&self) -> Result<(), OutOfRange> {
-        let range = |key, value: String, ok: bool, remedy| if ok { Ok(()) } else { Err((key, value, remedy)) };
+        let range =
+            |key, value: String, ok: bool, remedy| if ok { Ok(()) } else { Err((key, value, remedy)) };
         let t = self.temperature;
         range("semantics.temperature", t.to_string(), t > 0.0 && t <= 1e6, "must be above 0 and up to 1e6")?;
         let p = self.part_weight;
@@ -149,7 +149,8 @@ impl SemanticsConfig {
         range("semantics.cached_rays", n.to_string(), (1..=1 << 24).contains(&n), "must be 1 to 16777216")?;
         let n = self.samples;
         range("semantics.samples", n.to_string(), (1..=32).contains(&n), "must be 1 to 32")?;
-        let rates = [("semantics.table_rate", self.table_rate), ("semantics.network_rate", self.network_rate)];
+        let rates =
+            [("semantics.table_rate", self.table_rate), ("semantics.network_rate", self.network_rate)];
         for (key, rate) in rates {
             range(key, rate.to_string(), rate.is_finite() && rate >= 0.0, "must be finite and not negative")?;
         }

@@ -177,7 +177,8 @@ impl SemanticFields {
         if !path.is_file() {
             return Ok(None);
         }
-        let bytes = std::fs::read(&path).map_err(|source| SemanticsError::Io { path: path.clone(), source })?;
+        let bytes =
+            std::fs::read(&path).map_err(|source| SemanticsError::Io { path: path.clone(), source })?;
         let bad = |e: &dyn std::fmt::Display| damaged(&path, &e.to_string());
         let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(|e| bad(&e))?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| bad(&e))?;
@@ -192,13 +193,8 @@ impl SemanticFields {
             if tensor.dtype() != Dtype::F32 || len.is_some_and(|n| tensor.data().len() != n * 4) {
                 return Err(damaged(&path, &format!("{name} has the wrong size")));
             }
-            let values: Vec<f32> = tensor
-                .data()
-                .as_chunks::<4>()
-                .0
-                .iter()
-                .map(|b| f32::from_le_bytes(*b))
-                .collect();
+            let values: Vec<f32> =
+                tensor.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
             match values.iter().position(|v| !v.is_finite()) {
                 Some(n) => Err(damaged(&path, &format!("{name}[{n}] is not finite"))),
                 None => Ok(values),
@@ -214,8 +210,9 @@ impl SemanticFields {
                 return Err(damaged(&path, "its networks cannot be"));
             }
             let name = |part: &str| format!("{}.{part}", space.name());
-            let compressor =
-                Compressor::from_stored::<SemanticsError>(&stored.compressor, |part| fetch(&name(part), None))?;
+            let compressor = Compressor::from_stored::<SemanticsError>(&stored.compressor, |part| {
+                fetch(&name(part), None)
+            })?;
             if compressor.dim() != stored.shape.dim {
                 return Err(damaged(&path, "its networks do not fit its compression"));
             }

@@ -55,8 +55,7 @@ impl TextSource {
     /// # Errors
     /// [`SemanticsError::Phrase`] if none does.
     pub fn embedding(&self, space: Space, phrase: &str) -> Result<Vec<f32>, SemanticsError> {
-        self.known(space, phrase)
-            .ok_or_else(|| SemanticsError::Phrase { phrase: phrase.to_owned(), space })
+        self.known(space, phrase).ok_or_else(|| SemanticsError::Phrase { phrase: phrase.to_owned(), space })
     }
 
     /// Phrases ready to be held against features that `compressor` made short.

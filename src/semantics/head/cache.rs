@@ -52,7 +52,13 @@ impl Sources {
     /// Traces `inputs`, rays of `views`, and keeps of each at most `keep` samples.
     ///
     /// The result does not depend on the number of threads.
-    pub fn trace(model: &Model, views: &[View], inputs: &[RayInput], sampling: &Sampling, keep: usize) -> Self {
+    pub fn trace(
+        model: &Model,
+        views: &[View],
+        inputs: &[RayInput],
+        sampling: &Sampling,
+        keep: usize,
+    ) -> Self {
         let arch = pulp::Arch::new();
         let parts: Vec<Self> = inputs
             .par_chunks(CHUNK_RAYS * TASK_CHUNKS)

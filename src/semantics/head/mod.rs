@@ -78,7 +78,13 @@ pub struct Heads {
 
 impl HeadShape {
     /// For the field of a scene with `frames` frames that have features.
-    pub fn new(config: &SemanticsConfig, field: &FieldShape, frames: usize, dim: usize, parts: usize) -> Self {
+    pub fn new(
+        config: &SemanticsConfig,
+        field: &FieldShape,
+        frames: usize,
+        dim: usize,
+        parts: usize,
+    ) -> Self {
         Self {
             dim,
             parts,
@@ -101,12 +107,11 @@ impl HeadShape {
         let c = &self.encodings[stream as usize];
         let actor = stream == Stream::Actor;
         let extent = if actor { Vec3::ONE } else { self.extent };
-        let planes: &[[usize; 2]] = if actor { &[[0, 1]] } else { &[[0, 1], [0, 2], [1, 2]] };
         // A lattice point between two frames that are farther apart than a cell would never be trained.
         let frames = (0.5 * self.frames as f32).max(1.0);
         let (coarsest, finest) = ([c.coarsest, 0.25 * frames], [c.time_finest, frames]);
         HashGrid::new(extent, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows)
-            .with_time(extent, planes, c.time_levels, coarsest, finest, c.log2_rows)
+            .with_time(extent, c.time_levels, coarsest, finest, c.log2_rows)
     }
 
     fn net(&self, stream: Stream) -> HeadNet {
@@ -125,7 +130,9 @@ impl Heads {
         let tables = |n: &HeadNet| n.grid.levels.iter().map(|l| vec![Row::ZERO; l.rows]).collect();
         Self {
             tables: nets.each_ref().map(|n| n.as_ref().map_or(Vec::new(), tables)),
-            weights: nets.each_ref().map(|n| n.as_ref().map_or(Vec::new(), |n| vec![0.0; n.mlp.parameters()])),
+            weights: nets
+                .each_ref()
+                .map(|n| n.as_ref().map_or(Vec::new(), |n| vec![0.0; n.mlp.parameters()])),
             nets,
             shape,
         }

@@ -146,8 +146,15 @@ impl HeadOptimiser {
     }
 
     /// Runs one step; the mean loss of its rays.
-    pub fn step(&mut self, heads: &mut Heads, sources: &Sources, targets: &RayTargets, plan: &HeadStep) -> f64 {
-        let bags = if targets.bags.is_empty() { 0 } else { (plan.rays / plan.bag.max(1)).div_ceil(GROUPS).max(1) };
+    pub fn step(
+        &mut self,
+        heads: &mut Heads,
+        sources: &Sources,
+        targets: &RayTargets,
+        plan: &HeadStep,
+    ) -> f64 {
+        let bags =
+            if targets.bags.is_empty() { 0 } else { (plan.rays / plan.bag.max(1)).div_ceil(GROUPS).max(1) };
         let per_group = if bags > 0 { bags * plan.bag.max(1) } else { plan.rays.div_ceil(GROUPS) };
         let count = (per_group * GROUPS) as f32;
         let model = HeadModel::new(heads, plan.precision);

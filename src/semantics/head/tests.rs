@@ -38,7 +38,12 @@ fn random_heads(seed: u64) -> Heads {
     let mut rng = Rng::new(seed, 1, 0);
     let mut noise = || rng.uniform() - 0.5;
     heads.weights.iter_mut().flatten().for_each(|w| *w = noise());
-    heads.tables.iter_mut().flatten().flatten().for_each(|row| *row = Row::from_array([0; 4].map(|_| noise())));
+    heads
+        .tables
+        .iter_mut()
+        .flatten()
+        .flatten()
+        .for_each(|row| *row = Row::from_array([0; 4].map(|_| noise())));
     heads
 }
 
@@ -192,7 +197,15 @@ fn the_comparison_of_gradients_notices_a_wrong_weight() {
 }
 
 fn plan(step: u64) -> HeadStep {
-    HeadStep { step, rays: 64, bag: 4, table_rate: 1e-2, network_rate: 5e-3, precision: Precision::F32, seed: 9 }
+    HeadStep {
+        step,
+        rays: 64,
+        bag: 4,
+        table_rate: 1e-2,
+        network_rate: 5e-3,
+        precision: Precision::F32,
+        seed: 9,
+    }
 }
 
 fn trained(threads: usize, steps: u64) -> (Heads, f64) {

@@ -148,11 +148,13 @@ fn choose_pixels(
     // Some frames have targets in a corner only: what counts is how many pixels have one, by a sample of them.
     let sampled = |n: &usize| {
         let c = &frames[*n].camera;
-        let lattice = (0..c.height).step_by(SAMPLED).flat_map(|y| (0..c.width).step_by(SAMPLED).map(move |x| (x, y)));
+        let lattice =
+            (0..c.height).step_by(SAMPLED).flat_map(|y| (0..c.width).step_by(SAMPLED).map(move |x| (x, y)));
         lattice.filter(|(x, y)| targets.any(&Pixel { frame: *n as u32, x: *x, y: *y })).count()
     };
     let with_target = with.par_iter().map(sampled).sum::<usize>() * SAMPLED * SAMPLED;
-    let side = (1..64u32).find(|side| with_target / (side * side) as usize <= settings.cached_rays).unwrap_or(64);
+    let side =
+        (1..64u32).find(|side| with_target / (side * side) as usize <= settings.cached_rays).unwrap_or(64);
     let chosen: Vec<Result<Vec<Pixel>, SemanticsError>> = with
         .par_iter()
         .map(|n| {
@@ -161,9 +163,10 @@ fn choose_pixels(
             let mask = frame.load_mask()?;
             let mut rng = Rng::new(seed, PIXEL_STREAM, *n as u64);
             let mut pixels = Vec::new();
-            for (y, x) in (0..height).step_by(side as usize).flat_map(|y| {
-                (0..width).step_by(side as usize).map(move |x| (y, x))
-            }) {
+            for (y, x) in (0..height)
+                .step_by(side as usize)
+                .flat_map(|y| (0..width).step_by(side as usize).map(move |x| (y, x)))
+            {
                 let (dx, dy) = (rng.below(side as usize) as u32, rng.below(side as usize) as u32);
                 let (x, y) = ((x + dx).min(width - 1), (y + dy).min(height - 1));
                 let pixel = Pixel { frame: *n as u32, x, y };
@@ -385,4 +388,3 @@ fn gather(
     let times = pixels.iter().map(|p| frames[p.frame as usize].time as f32).collect();
     RayTargets { width, dim, values, weights, usable, times, bags: Bags::default() }
 }
-
