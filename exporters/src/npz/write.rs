@@ -45,7 +45,7 @@ pub fn write_npz(path: &Path, geometry: &Geometry, compression: NpzCompression) 
 /// # Errors
 /// `Inconsistent` for values that do not fill their rows; `Io`.
 pub fn write_npz_matrices(path: &Path, matrices: &[(&str, usize, &[f32])]) -> Result<()> {
-    let uneven = |m: &&(&str, usize, &[f32])| m.1 == 0 || m.2.len() % m.1 != 0;
+    let uneven = |m: &&(&str, usize, &[f32])| m.1 == 0 || !m.2.len().is_multiple_of(m.1);
     if let Some((name, columns, values)) = matrices.iter().find(uneven) {
         let reason = format!("`{name}` has {} values in {columns} columns", values.len());
         return Err(Error::inconsistent(&path.display().to_string(), reason));

@@ -48,11 +48,13 @@ fn trace(seed: u64) -> Traced {
     trace_with(seed, Precision::F32)
 }
 
-/// Seeds whose chunk looks at every frame.
+/// Seeds whose chunk looks at every frame, and along an even row.
 fn seeds() -> impl Iterator<Item = u64> {
     let sees_all = |seed: &u64| {
         let traced = trace(*seed);
-        (0..traced.pixels.frames.len() as u32).all(|n| traced.chunk.inputs.iter().any(|i| i.view == n))
+        let sees = |n| traced.chunk.inputs.iter().any(|i| i.view == n);
+        let frames = traced.pixels.frames.len() as u32;
+        traced.chunk.bends.iter().any(|b| b.weight > 0.2) && (0..frames).all(sees)
     };
     (1..).filter(sees_all)
 }
@@ -100,7 +102,7 @@ fn trace_with(seed: u64, precision: Precision) -> Traced {
         transient: 1.0,
         distortion: 10.0,
         entropy: 5.0,
-        flatness: 300.0,
+        flatness: 50.0,
         exposure: 100.0,
         ..config.loss
     };
