@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::field::FieldConfig;
 use crate::map::MapConfig;
+use crate::stereo::StereoConfig;
 use crate::train::TrainConfig;
 use crate::train::loss::LossConfig;
 
@@ -34,6 +35,8 @@ pub struct Config {
     pub train: TrainConfig,
     /// The loss.
     pub loss: LossConfig,
+    /// Depth by stereo.
+    pub stereo: StereoConfig,
     /// The field.
     pub field: FieldConfig,
     /// What is extracted from it.
@@ -116,6 +119,12 @@ impl Config {
         for (key, rate) in [("train.table_rate", t.table_rate), ("train.network_rate", t.network_rate)] {
             range(key, rate.to_string(), rate.is_finite() && rate >= 0.0, "must be finite and not negative")?;
         }
+        for (key, share) in [("train.stereo_at", t.stereo_at), ("train.static_until", t.static_until)] {
+            range(key, share.to_string(), (0.0..=1.0).contains(&share), "must be 0 to 1")?;
+        }
+        let sorted = t.align_at.is_sorted() && t.align_at.iter().all(|a| (0.0..=1.0).contains(a));
+        range("train.align_at", format!("{:?}", t.align_at), sorted, "must be rising numbers from 0 to 1")?;
+        self.stereo.validate()?;
         let b = self.loss.beta_min;
         range("loss.beta_min", b.to_string(), b.is_finite() && b > 0.0, "must be positive")?;
         for (key, c) in [

@@ -3,7 +3,7 @@
 //! ```text
 //! scene → field → render → train → extract → semantics → map → files
 //! ```
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 mod bvh;
 pub mod config;
@@ -17,6 +17,7 @@ pub mod report;
 mod rng;
 pub mod scene;
 pub mod semantics;
-mod simd;
+pub mod simd;
+pub mod stereo;
 pub mod synth;
 pub mod train;

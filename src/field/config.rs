@@ -22,6 +22,10 @@ pub struct StreamConfig {
     pub code: usize,
     /// Knots of the frame code over the video; 0: one for every training frame.
     pub knots: usize,
+    /// Lattices over two axes of space and time, for each pair of axes (dynamic) or for the image (actor); 0: none.
+    pub time_levels: usize,
+    /// Cells along the longest side of the box at the finest of them; along time it has one cell for two frames.
+    pub time_finest: f32,
     /// Added to the raw density, so that training starts from a nearly empty box.
     pub density_bias: f32,
 }
@@ -53,6 +57,8 @@ impl Default for FieldConfig {
             layers: 1,
             code: 0,
             knots: 0,
+            time_levels: 0,
+            time_finest: 0.0,
             density_bias: -3.0,
         };
         let dynamic = StreamConfig {
@@ -61,6 +67,8 @@ impl Default for FieldConfig {
             layers: 2,
             code: 16,
             knots: 16,
+            time_levels: 2,
+            time_finest: 96.0,
             density_bias: -5.0,
             ..persistent.clone()
         };
@@ -70,6 +78,8 @@ impl Default for FieldConfig {
             finest: 64.0,
             log2_rows: 16,
             knots: 70,
+            time_levels: 3,
+            time_finest: 48.0,
             ..dynamic.clone()
         };
         Self { persistent, dynamic, actor, actor_reach: 0.25, near: 0.015 }

@@ -7,7 +7,7 @@
 
 use glam::{Vec3, Vec4};
 
-use crate::simd::TILE;
+use crate::simd::{TILE, floor_within};
 
 /// Features per level: one 16-byte row.
 pub const FEATURES: usize = 4;
@@ -15,10 +15,21 @@ pub const FEATURES: usize = 4;
 /// One table row; a `Vec4` rather than an array because the compiler keeps it in one vector register.
 pub type Row = Vec4;
 
+/// Axes that lattices can span: three of space, and time.
+pub const AXES: usize = 4;
+
+/// The axis of time.
+pub const TIME: usize = 3;
+
+/// Points of one tile, `[axis][lane]`.
+pub type Points = [[f32; TILE]; AXES];
+
 /// The lattice of one level.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Level {
-    /// Cells per unit length.
+    /// The three axes that it spans.
+    pub axes: [usize; 3],
+    /// Cells per unit length along each of them.
     pub scale: Vec3,
     /// Largest cell index along each axis.
     last_cell: [u32; 3],
@@ -53,62 +64,46 @@ impl HashGrid {
         let levels = (0..levels)
             .map(|n| {
                 let scale = coarsest * (finest / coarsest).powf(growth(n));
-                Level::new(extent, scale, 1usize << log2_rows)
+                Level::new([0, 1, 2], extent, scale, 1usize << log2_rows)
             })
             .collect();
         Self { levels }
+    }
+
+    /// Adds `levels` lattices over each of `planes` (two axes of space) and time, from `coarsest` to `finest` cells per
+    /// unit of space and time.
+    ///
+    /// Space alone can only be modulated by a frame's code; here things can move (Cao and Johnson 2023, HexPlane).
+    pub fn with_time(
+        mut self,
+        extent: Vec3,
+        planes: &[[usize; 2]],
+        levels: usize,
+        coarsest: [f32; 2],
+        finest: [f32; 2],
+        log2_rows: u32,
+    ) -> Self {
+        for n in 0..levels {
+            let growth = if levels > 1 { n as f32 / (levels - 1) as f32 } else { 1.0 };
+            let [space, time] = std::array::from_fn(|k| coarsest[k] * (finest[k] / coarsest[k]).powf(growth));
+            for &[a, b] in planes {
+                let size = Vec3::new(extent[a], extent[b], 1.0);
+                let scale = Vec3::new(space, space, time);
+                self.levels.push(Level::new([a, b, TIME], size, scale, 1usize << log2_rows));
+            }
+        }
+        self
     }
 
     /// Width of the encoding.
     pub fn width(&self) -> usize {
         self.levels.len() * FEATURES
     }
-
-    /// Writes the features of one tile of points (`pos`: x, y, z rows) to `out` `[width][TILE]`.
-    #[inline(always)]
-    pub fn encode(&self, tables: &[Vec<Row>], pos: &[[f32; TILE]; 3], out: &mut [f32]) {
-        for ((level, table), out) in self.levels.iter().zip(tables).zip(out.chunks_exact_mut(FEATURES * TILE))
-        {
-            let (o0, rest) = out.split_at_mut(TILE);
-            let (o1, rest) = rest.split_at_mut(TILE);
-            let (o2, o3) = rest.split_at_mut(TILE);
-            let corners = level.corners(pos);
-            for s in 0..TILE {
-                let row = corners.interpolate(table, s);
-                o0[s] = row.x;
-                o1[s] = row.y;
-                o2[s] = row.z;
-                o3[s] = row.w;
-            }
-        }
-    }
-
-    /// Gradient with respect to the positions of a tile, of a loss whose gradient with respect to the encoding is
-    /// `grad` `[width][TILE]`.
-    #[inline(always)]
-    pub fn position_gradient(
-        &self,
-        tables: &[Vec<Row>],
-        pos: &[[f32; TILE]; 3],
-        grad: &[f32],
-    ) -> [[f32; TILE]; 3] {
-        let mut out = [[0.0; TILE]; 3];
-        for ((level, table), g) in self.levels.iter().zip(tables).zip(grad.chunks_exact(FEATURES * TILE)) {
-            let corners = level.corners(pos);
-            for s in 0..TILE {
-                let g = Row::new(g[s], g[TILE + s], g[2 * TILE + s], g[3 * TILE + s]);
-                let d = corners.position_gradient(table, g, s) * level.scale;
-                out[0][s] += d.x;
-                out[1][s] += d.y;
-                out[2][s] += d.z;
-            }
-        }
-        out
-    }
 }
 
 impl Level {
-    fn new(extent: Vec3, scale: Vec3, max_rows: usize) -> Self {
+    /// `extent` is along `axes`.
+    fn new(axes: [usize; 3], extent: Vec3, scale: Vec3, max_rows: usize) -> Self {
         let cells = (extent * scale).ceil().max(Vec3::ONE).as_uvec3();
         let points = [cells.x + 1, cells.y + 1, cells.z + 1];
         let lattice = points.iter().map(|&p| p as usize).product::<usize>();
@@ -119,39 +114,55 @@ impl Level {
             // Instant-ngp's primes; 1 for x keeps neighbours in x on one cache line.
             ([1, 2_654_435_761, 805_459_861], max_rows)
         };
-        Self { scale, last_cell: [cells.x - 1, cells.y - 1, cells.z - 1], stride, rows, dense }
+        Self { axes, scale, last_cell: [cells.x - 1, cells.y - 1, cells.z - 1], stride, rows, dense }
+    }
+
+    /// Writes the features of one tile of points to `out`, a row a point.
+    #[inline(always)]
+    pub fn encode(&self, table: &[Row], pos: &Points, out: &mut [Row]) {
+        let corners = self.corners(pos);
+        for (s, out) in out.iter_mut().enumerate() {
+            *out = corners.interpolate(table, s).0;
+        }
+    }
+
+    /// As [`Self::encode`], and each point's derivatives of its features by x, y and z.
+    #[inline(always)]
+    pub fn encode_with_slopes(&self, table: &[Row], pos: &Points, out: &mut [Row], slopes: &mut [[Row; 3]]) {
+        let corners = self.corners(pos);
+        for (s, (out, slopes)) in out.iter_mut().zip(slopes).enumerate() {
+            let (value, by) = corners.interpolate(table, s);
+            *out = value;
+            *slopes = [Row::ZERO; 3];
+            for k in (0..3).filter(|&k| self.axes[k] != TIME) {
+                slopes[self.axes[k]] = by[k] * self.scale[k];
+            }
+        }
     }
 
     #[inline(always)]
-    fn corners(&self, pos: &[[f32; TILE]; 3]) -> Corners {
+    fn corners(&self, pos: &Points) -> Corners {
         let mut cell = [[0u32; TILE]; 3];
         let mut frac = [[0.0f32; TILE]; 3];
         for axis in 0..3 {
-            let (scale, last) = (self.scale[axis], self.last_cell[axis] as i32);
+            let (scale, last) = (self.scale[axis], self.last_cell[axis] as f32);
             for s in 0..TILE {
-                let q = pos[axis][s] * scale;
-                // `as i32` saturates: a point outside the box (or NaN) lands in the nearest cell (or the first).
-                let c = (q as i32).clamp(0, last);
-                cell[axis][s] = c as u32;
-                frac[axis][s] = (q - c as f32).clamp(0.0, 1.0);
+                let q = pos[self.axes[axis]][s] * scale;
+                // A point outside the box (or NaN) lands in the nearest cell (or the first).
+                let (index, c) = floor_within(q, last);
+                cell[axis][s] = index;
+                frac[axis][s] = (q - c).clamp(0.0, 1.0);
             }
         }
         let mut rows = [[0u32; TILE]; 8];
-        let mask = self.rows as u32 - 1;
-        for s in 0..TILE {
-            let (x0, x1) = (cell[0][s], cell[0][s] + 1);
-            let y0 = cell[1][s].wrapping_mul(self.stride[1]);
-            let y1 = y0.wrapping_add(self.stride[1]);
-            let z0 = cell[2][s].wrapping_mul(self.stride[2]);
-            let z1 = z0.wrapping_add(self.stride[2]);
-            for (n, (y, z)) in [(y0, z0), (y1, z0), (y0, z1), (y1, z1)].into_iter().enumerate() {
-                if self.dense {
-                    rows[2 * n][s] = x0 + y + z;
-                    rows[2 * n + 1][s] = x1 + y + z;
-                } else {
-                    rows[2 * n][s] = (x0 ^ y ^ z) & mask;
-                    rows[2 * n + 1][s] = (x1 ^ y ^ z) & mask;
-                }
+        let (stride, mask) = (self.stride, self.rows as u32 - 1);
+        for (n, rows) in rows.iter_mut().enumerate() {
+            let [dx, dy, dz] = [n as u32 & 1, n as u32 >> 1 & 1, n as u32 >> 2];
+            for s in 0..TILE {
+                let x = cell[0][s] + dx;
+                let y = (cell[1][s] + dy).wrapping_mul(stride[1]);
+                let z = (cell[2][s] + dz).wrapping_mul(stride[2]);
+                rows[s] = if self.dense { x.wrapping_add(y).wrapping_add(z) } else { (x ^ y ^ z) & mask };
             }
         }
         Corners { rows, frac }
@@ -160,7 +171,7 @@ impl Level {
     /// Adds the gradients `g` of a tile's features to the rows around its points `pos`, by the weights with which
     /// they were read.
     #[inline(always)]
-    pub fn scatter(&self, grads: &mut [Row], pos: &[[f32; TILE]; 3], g: &[Row]) {
+    pub fn scatter(&self, grads: &mut [Row], pos: &Points, g: &[Row]) {
         let c = self.corners(pos);
         for (s, g) in g.iter().enumerate() {
             let (fx, fy, fz) = (c.frac[0][s], c.frac[1][s], c.frac[2][s]);
@@ -175,30 +186,18 @@ impl Level {
 }
 
 impl Corners {
+    /// Features of lane `s`, and their derivatives by its three fractions.
     #[inline(always)]
-    fn interpolate(&self, table: &[Row], s: usize) -> Row {
+    fn interpolate(&self, table: &[Row], s: usize) -> (Row, [Row; 3]) {
         let row = |n: usize| table[self.rows[n][s] as usize];
         let [fx, fy, fz] = [self.frac[0][s], self.frac[1][s], self.frac[2][s]];
-        let along_x = |n: usize| {
-            let (a, b) = (row(n), row(n + 1));
-            a + (b - a) * fx
-        };
-        let (a, b) = (along_x(0), along_x(2));
-        let (c, d) = (along_x(4), along_x(6));
+        // By x along four edges, by y across two faces, by z through the cell.
+        let (r0, r2, r4, r6) = (row(0), row(2), row(4), row(6));
+        let (d0, d2, d4, d6) = (row(1) - r0, row(3) - r2, row(5) - r4, row(7) - r6);
+        let (a, b, c, d) = (r0 + d0 * fx, r2 + d2 * fx, r4 + d4 * fx, r6 + d6 * fx);
         let (e, f) = (a + (b - a) * fy, c + (d - c) * fy);
-        e + (f - e) * fz
-    }
-
-    /// Gradient with respect to the fractions of lane `s`.
-    #[inline(always)]
-    fn position_gradient(&self, table: &[Row], g: Row, s: usize) -> Vec3 {
-        let v = |n: usize| table[self.rows[n][s] as usize].dot(g);
-        let v = [v(0), v(1), v(2), v(3), v(4), v(5), v(6), v(7)];
-        let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
-        let [x, y, z] = [self.frac[0][s], self.frac[1][s], self.frac[2][s]];
-        let dx = mix(mix(v[1] - v[0], v[3] - v[2], y), mix(v[5] - v[4], v[7] - v[6], y), z);
-        let dy = mix(mix(v[2] - v[0], v[3] - v[1], x), mix(v[6] - v[4], v[7] - v[5], x), z);
-        let dz = mix(mix(v[4] - v[0], v[5] - v[1], x), mix(v[6] - v[2], v[7] - v[3], x), y);
-        Vec3::new(dx, dy, dz)
+        let (xe, xf) = (d0 + (d2 - d0) * fy, d4 + (d6 - d4) * fy);
+        let by_y = (b - a) + ((d - c) - (b - a)) * fz;
+        (e + (f - e) * fz, [xe + (xf - xe) * fz, by_y, f - e])
     }
 }

@@ -3,11 +3,11 @@
 
 use glam::Vec3;
 
-use super::hashgrid::{FEATURES, HashGrid, Row};
+use super::hashgrid::{AXES, HashGrid, Level, Points, Row};
 use crate::rng::Rng;
 use crate::simd::TILE;
 
-type Tile = [[f32; TILE]; 3];
+type Tile = Points;
 
 const EXTENT: Vec3 = Vec3::new(1.0, 0.75, 0.5);
 
@@ -26,7 +26,7 @@ fn grid(seed: u64) -> (HashGrid, Vec<Vec<Row>>) {
 }
 
 fn tile(points: impl IntoIterator<Item = Vec3>) -> Tile {
-    let mut out = [[0.25; TILE]; 3];
+    let mut out = [[0.25; TILE]; AXES];
     for (lane, p) in points.into_iter().take(TILE).enumerate() {
         for axis in 0..3 {
             out[axis][lane] = p[axis];
@@ -35,14 +35,14 @@ fn tile(points: impl IntoIterator<Item = Vec3>) -> Tile {
     out
 }
 
-fn encode(grid: &HashGrid, tables: &[Vec<Row>], pos: &Tile) -> Vec<f32> {
-    let mut out = vec![0.0; grid.width() * TILE];
-    grid.encode(tables, pos, &mut out);
-    out
-}
-
-fn features(encoded: &[f32], level: usize, lane: usize) -> Row {
-    Row::from_array(std::array::from_fn(|k| encoded[(level * FEATURES + k) * TILE + lane]))
+/// Every level's features of a tile, `[level][lane]`.
+fn encode(grid: &HashGrid, tables: &[Vec<Row>], pos: &Tile) -> Vec<[Row; TILE]> {
+    let encode = |(level, table): (&Level, &Vec<Row>)| {
+        let mut out = [Row::ZERO; TILE];
+        level.encode(table, pos, &mut out);
+        out
+    };
+    grid.levels.iter().zip(tables).map(encode).collect()
 }
 
 fn random_points(seed: u64) -> Vec<Vec3> {
@@ -61,7 +61,7 @@ fn lattice_points_of_a_dense_level_get_their_own_row() {
         let encoded = encode(&grid, &tables, &tile(points));
         for (lane, p) in some.iter().enumerate() {
             let row = tables[0][p[0] + 5 * (p[1] + 4 * p[2])];
-            let error = (features(&encoded, 0, lane) - row).abs().max_element();
+            let error = (encoded[0][lane] - row).abs().max_element();
             // a + (b − a)·1 rounds twice; everywhere else the fraction is 0 and the row is exact.
             assert!(error <= 3e-7, "{p:?} is off by {error:e}");
         }
@@ -80,7 +80,7 @@ fn a_dense_level_is_linear_along_each_axis_of_a_cell() {
             p
         };
         let encoded = encode(&grid, &tables, &tile([at(0.0), at(0.3), at(0.999_999)]));
-        let [a, b, c] = [0, 1, 2].map(|lane| features(&encoded, 0, lane));
+        let [a, b, c] = [0, 1, 2].map(|lane| encoded[0][lane]);
         assert!((a + 0.3 * (c - a) - b).abs().max_element() < 3e-6, "axis {axis}");
         assert!((c - a).abs().max_element() > 1e-2, "axis {axis} does not matter");
     }
@@ -100,7 +100,7 @@ fn all_levels_are_continuous_across_cells() {
             }
             let encoded = encode(&grid, &tables, &tile(points));
             for lane in (0..TILE).step_by(2) {
-                let jump = features(&encoded, level, lane + 1) - features(&encoded, level, lane);
+                let jump = encoded[level][lane + 1] - encoded[level][lane];
                 // 2e-6 of 40 cells a unit, rows up to 2 apart.
                 assert!(jump.abs().max_element() < 2e-4, "level {level}, axis {axis}: jump of {jump}");
             }
@@ -119,7 +119,7 @@ fn scatter_is_the_transpose_of_encode() {
         let mut scattered = vec![Row::ZERO; l.rows];
         l.scatter(&mut scattered, &pos, &g);
         let dot = |a: Row, b: Row| f64::from(a.dot(b));
-        let left: f64 = (0..TILE).map(|n| dot(features(&encoded, level, n), g[n])).sum();
+        let left: f64 = (0..TILE).map(|n| dot(encoded[level][n], g[n])).sum();
         let right: f64 = scattered.iter().zip(&tables[level]).map(|(a, b)| dot(*a, *b)).sum();
         assert!(
             (left - right).abs() < 1e-5 * (1.0 + left.abs()),
@@ -130,29 +130,26 @@ fn scatter_is_the_transpose_of_encode() {
 }
 
 #[test]
-fn position_gradient_is_the_derivative() {
+fn slopes_are_the_derivatives() {
     let (grid, tables) = grid(5);
-    let mut rng = Rng::new(5, 2, 0);
-    let grad: Vec<f32> = (0..grid.width() * TILE).map(|_| 2.0 * rng.uniform() - 1.0).collect();
     // In the middle of a cell, so that the difference stays inside it, where the encoding is linear along each axis.
     let middle = |p: Vec3| ((p * 40.0).floor() + 0.5) / 40.0;
     let points: Vec<Vec3> = random_points(5).into_iter().map(middle).collect();
-    let gradient = grid.position_gradient(&tables, &tile(points.clone()), &grad);
-    let value = |encoded: &[f32], lane: usize| -> f64 {
-        (0..grid.width())
-            .map(|k| f64::from(encoded[k * TILE + lane]) * f64::from(grad[k * TILE + lane]))
-            .sum()
-    };
-    for axis in 0..3 {
-        let mut h = Vec3::ZERO;
-        h[axis] = 1.0 / 256.0;
-        let above = encode(&grid, &tables, &tile(points.iter().map(|p| *p + h)));
-        let below = encode(&grid, &tables, &tile(points.iter().map(|p| *p - h)));
-        for lane in 0..TILE {
-            let d = (value(&above, lane) - value(&below, lane)) * 128.0;
-            let g = f64::from(gradient[axis][lane]);
-            // Values of order 1 are rounded to 1e-7 and divided by 1/128.
-            assert!((g - d).abs() < 1e-3 + 1e-4 * d.abs(), "axis {axis}: gradient {g}, difference {d}");
+    for (n, (level, table)) in grid.levels.iter().zip(&tables).enumerate() {
+        let (mut rows, mut slopes) = ([Row::ZERO; TILE], [[Row::ZERO; 3]; TILE]);
+        level.encode_with_slopes(table, &tile(points.clone()), &mut rows, &mut slopes);
+        assert_eq!(rows, encode(&grid, &tables, &tile(points.clone()))[n]);
+        for axis in 0..3 {
+            let mut h = Vec3::ZERO;
+            h[axis] = 1.0 / 256.0;
+            let above = encode(&grid, &tables, &tile(points.iter().map(|p| *p + h)));
+            let below = encode(&grid, &tables, &tile(points.iter().map(|p| *p - h)));
+            for lane in 0..TILE {
+                let difference = (above[n][lane] - below[n][lane]) * 128.0;
+                let error = (difference - slopes[lane][axis]).abs().max_element();
+                // Values of order 1 are rounded to 1e-7 and divided by 1/128.
+                assert!(error < 1e-4, "level {n}, axis {axis}: off by {error:e}");
+            }
         }
     }
 }
@@ -166,14 +163,16 @@ fn points_outside_the_box_or_not_finite_are_harmless() {
     let encoded = encode(&grid, &tables, &pos);
     for (lane, p) in points.iter().enumerate() {
         if !p.is_nan() {
-            let f = features(&encoded, 0, lane).abs().max_element();
+            let f = encoded[0][lane].abs().max_element();
             assert!(f <= 1.0 + 1e-6, "{p} gives {f}");
         }
     }
     for level in &grid.levels {
         level.scatter(&mut vec![Row::ZERO; level.rows], &pos, &[Row::ONE; TILE]);
     }
-    grid.position_gradient(&tables, &pos, &encoded);
+    for (level, table) in grid.levels.iter().zip(&tables) {
+        level.encode_with_slopes(table, &pos, &mut [Row::ZERO; TILE], &mut [[Row::ZERO; 3]; TILE]);
+    }
     let clamped = encode(&grid, &tables, &tile([EXTENT, Vec3::ZERO]));
     let outside = encode(&grid, &tables, &tile([EXTENT * 3.0, -EXTENT]));
     assert_eq!(clamped, outside, "a point outside is seen at the nearest point of the box");

@@ -2,8 +2,9 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::mlp::{Mlp, TileView};
+use super::mlp::{Activations, Mlp, Precision};
 use crate::rng::Rng;
+use crate::simd::matrix::Unit;
 use crate::simd::{AlignedVec, TILE};
 
 /// Tiles of a chunk.
@@ -22,33 +23,40 @@ struct Case {
     grads: AlignedVec,
 }
 
-/// What the kernels make of a case.
+/// What the kernels make of a case: outputs `[tile][output][TILE]`, gradients of the inputs, and of the parameters.
 struct Outcome {
-    tiles: AlignedVec,
-    grads: AlignedVec,
+    values: Vec<f32>,
+    gradients: Vec<f32>,
     params: Vec<f32>,
 }
 
-struct Pass<'a>(&'a Case);
+struct Pass<'a>(&'a Case, Precision, Unit);
 
 impl WithSimd for Pass<'_> {
     type Output = Outcome;
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Outcome {
-        let Case { net, params, tiles, grads } = self.0;
-        let (mut tiles, mut grads) = (tiles.clone(), grads.clone());
-        let packed = net.pack(params);
-        let stride = net.rows() * TILE;
+        let Self(case, precision, unit) = self;
+        let Case { net, params, tiles, grads } = case;
+        let packed = net.pack(params, precision);
+        let (rows, input, output) = (net.rows() * TILE, net.input() * TILE, net.output_row() * TILE);
+        let mut a = Activations::default();
+        net.reserve(&packed, TILES, &mut a);
+        let (mut values, mut sums) = (Vec::new(), vec![0.0; net.parameters()]);
         for n in 0..TILES {
-            let tile = &mut tiles[n * stride..][..stride];
-            net.forward(simd, &packed, tile);
-            net.backward(simd, &packed, tile, &mut grads[n * stride..][..stride], true);
+            a.input(n).copy_from_slice(&tiles[n * rows..][..input]);
+            net.forward(simd, &unit, &packed, &mut a, n);
+            values.extend_from_slice(a.output(n));
         }
-        let mut sums = vec![0.0; net.parameters()];
-        let view = |data| TileView { data, stride, offset: 0 };
-        net.accumulate(simd, view(&tiles), view(&grads), TILES, &mut sums);
-        Outcome { tiles, grads, params: sums }
+        let mut gradients = Vec::new();
+        for n in 0..TILES {
+            a.output_grad(n).copy_from_slice(&grads[n * rows + output..(n + 1) * rows]);
+            net.backward(simd, &unit, &packed, &mut a, n);
+            gradients.extend_from_slice(a.input_grad(n));
+        }
+        net.accumulate(simd, &unit, &packed, &mut a, TILES, &mut sums);
+        Outcome { values, gradients, params: sums }
     }
 }
 
@@ -119,16 +127,18 @@ fn close(a: f32, b: f64, what: &str) {
 fn networks_match_f64_loops_forward_and_backward() {
     for (n, widths) in SHAPES.into_iter().enumerate() {
         let case = Case::new(widths, n as u64);
-        let out = pulp::Arch::new().dispatch(Pass(&case));
-        let rows = case.net.rows();
+        let out = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
         let mut sums = vec![0.0; case.net.parameters()];
         for tile in 0..TILES {
             for lane in 0..TILE {
                 let (values, grads) = case.naive(tile, lane, &mut sums);
-                for row in 0..rows {
-                    let k = (tile * rows + row) * TILE + lane;
-                    close(out.tiles[k], values[row], "activation");
-                    close(out.grads[k], grads[row], "gradient");
+                let (output, input) = (case.net.output(), case.net.input());
+                for row in 0..output {
+                    let k = (tile * output + row) * TILE + lane;
+                    close(out.values[k], values[case.net.output_row() + row], "output");
+                }
+                for row in 0..input {
+                    close(out.gradients[(tile * input + row) * TILE + lane], grads[row], "gradient");
                 }
             }
         }
@@ -144,11 +154,14 @@ fn networks_match_f64_loops_forward_and_backward() {
 fn all_fused_vector_widths_give_the_same_bits_per_sample() {
     for (n, widths) in SHAPES.into_iter().enumerate() {
         let case = Case::new(widths, n as u64);
-        let narrow = pulp::Scalar128b.vectorize(Pass(&case));
-        let wide = [pulp::Scalar256b.vectorize(Pass(&case)), pulp::Scalar512b.vectorize(Pass(&case))];
+        let narrow = pulp::Scalar128b.vectorize(Pass(&case, Precision::F32, Unit::Portable));
+        let wide = [
+            pulp::Scalar256b.vectorize(Pass(&case, Precision::F32, Unit::Portable)),
+            pulp::Scalar512b.vectorize(Pass(&case, Precision::F32, Unit::Portable)),
+        ];
         for out in &wide {
-            assert_eq!(bits(&out.tiles), bits(&narrow.tiles));
-            assert_eq!(bits(&out.grads), bits(&narrow.grads));
+            assert_eq!(bits(&out.values), bits(&narrow.values));
+            assert_eq!(bits(&out.gradients), bits(&narrow.gradients));
             for (a, b) in out.params.iter().zip(&narrow.params) {
                 close(*a, f64::from(*b), "parameter gradient");
             }
@@ -161,9 +174,9 @@ fn all_fused_vector_widths_give_the_same_bits_per_sample() {
 fn the_scalar_fallback_matches_the_hosts_instructions() {
     for (n, widths) in SHAPES.into_iter().enumerate() {
         let case = Case::new(widths, n as u64);
-        let host = pulp::Arch::new().dispatch(Pass(&case));
-        let plain = pulp::Scalar.vectorize(Pass(&case));
-        for (a, b) in host.tiles.iter().zip(plain.tiles.iter()) {
+        let host = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
+        let plain = pulp::Scalar.vectorize(Pass(&case, Precision::F32, Unit::Portable));
+        for (a, b) in host.values.iter().zip(&plain.values) {
             close(*a, f64::from(*b), "activation");
         }
         for (a, b) in host.params.iter().zip(&plain.params) {
@@ -174,4 +187,52 @@ fn the_scalar_fallback_matches_the_hosts_instructions() {
 
 fn bits(v: &[f32]) -> Vec<u32> {
     v.iter().map(|v| v.to_bits()).collect()
+}
+
+/// bf16 rounds every factor by up to 2⁻⁹, and flips some ReLUs: some per cent after four layers, in the mean.
+#[test]
+fn bf16_products_match_f32_ones() {
+    for (n, widths) in SHAPES.into_iter().enumerate() {
+        let case = Case::new(widths, n as u64);
+        let exact = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
+        let rounded = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::detect()));
+        for (a, b) in [
+            (&exact.values, &rounded.values),
+            (&exact.gradients, &rounded.gradients),
+            (&exact.params, &rounded.params),
+        ] {
+            let size: f32 = a.iter().map(|a| a * a).sum();
+            let error: f32 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
+            assert!(
+                error.sqrt() < 0.1 * size.sqrt(),
+                "{widths:?}: off by {} of {}",
+                error.sqrt(),
+                size.sqrt()
+            );
+        }
+    }
+}
+
+/// The matrix units and plain loops sum in another order; what that changes is rounded away, or to the next bf16.
+#[test]
+fn the_matrix_units_match_plain_loops() {
+    for (n, widths) in SHAPES.into_iter().enumerate() {
+        let case = Case::new(widths, n as u64);
+        let units = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::detect()));
+        let plain = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::Portable));
+        for (a, b) in [
+            (&units.values, &plain.values),
+            (&units.gradients, &plain.gradients),
+            (&units.params, &plain.params),
+        ] {
+            let size: f32 = a.iter().map(|a| a * a).sum();
+            let error: f32 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
+            assert!(
+                error.sqrt() < 1e-3 * size.sqrt(),
+                "{widths:?}: off by {} of {}",
+                error.sqrt(),
+                size.sqrt()
+            );
+        }
+    }
 }

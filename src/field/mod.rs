@@ -85,7 +85,8 @@ pub struct Layout {
     pub exposure: Range<usize>,
     /// Pose refinement: per knot, a rotation (rad) and a translation (units) in the camera's axes.
     pub pose: Range<usize>,
-    /// The rig: rotation, translation shared by all frames, and relative change of the focal length.
+    /// The rig: rotation and translation shared by all frames; relative change of the focal length, and of its growth
+    /// with the squared distance from the axis.
     pub rig: Range<usize>,
     /// Length of the whole vector.
     pub len: usize,
@@ -111,8 +112,14 @@ impl FieldShape {
     /// The lattices of a stream: over the box, or over the camera's frustum for the actor.
     pub fn grid(&self, stream: Stream) -> HashGrid {
         let c = self.config.stream(stream);
-        let extent = if stream == Stream::Actor { Vec3::ONE } else { self.normalisation.extent };
+        let actor = stream == Stream::Actor;
+        let extent = if actor { Vec3::ONE } else { self.normalisation.extent };
+        let planes: &[[usize; 2]] = if actor { &[[0, 1]] } else { &[[0, 1], [0, 2], [1, 2]] };
+        // A lattice point between two training frames that are farther apart than a cell would never be trained.
+        let frames = (0.5 * self.times.len() as f32).max(1.0);
+        let (coarsest, finest) = ([c.coarsest, 0.25 * frames], [c.time_finest, frames]);
         HashGrid::new(extent, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows)
+            .with_time(extent, planes, c.time_levels, coarsest, finest, c.log2_rows)
     }
 }
 

@@ -8,9 +8,10 @@ use std::ops::Range;
 use glam::Vec3;
 use pulp::Simd;
 
-use super::hashgrid::{FEATURES, HashGrid, Row};
-use super::mlp::{Mlp, Packed, TileView};
-use crate::simd::{self, AlignedVec, TILE};
+use super::hashgrid::{AXES, FEATURES, HashGrid, Level, Points, Row, TIME};
+use super::mlp::{Activations, Mlp, Packed};
+use crate::simd::matrix::Unit;
+use crate::simd::{self, TILE};
 
 /// Width of the trunk's output: raw density, then geometry features for the head.
 const GEOMETRY: usize = 16;
@@ -74,36 +75,52 @@ impl StreamSamples {
     }
 }
 
-/// The samples of a chunk at which one stream is evaluated, and the buffers to do so.
+/// What one level says about a batch's samples; after the way back, the gradient with respect to it.
+#[derive(Default)]
+pub struct LevelRows {
+    /// A row a lane, whole tiles.
+    pub rows: Vec<Row>,
+    /// Derivatives by x, y and z, likewise, where the batch asks for them.
+    slopes: Vec<[Row; 3]>,
+}
+
+/// The samples of a chunk at which one stream is evaluated, and their encoding.
 #[derive(Default)]
 pub struct StreamBatch {
     /// Which sample of the chunk each lane is.
     pub sample: Vec<u32>,
+    /// Which ray each lane belongs to; lanes of a ray follow one another and share its code and view.
+    ray: Vec<u32>,
     /// Positions, tile by tile.
-    pos: Vec<[[f32; TILE]; 3]>,
-    tiles: AlignedVec,
-    grads: AlignedVec,
+    pos: Vec<Points>,
+    /// The encoding, level by level.
+    pub levels: Vec<LevelRows>,
+    /// Whether the gradient with respect to the positions will be asked for.
+    pub slopes: bool,
 }
 
 impl StreamBatch {
     /// Forgets all samples.
     pub fn clear(&mut self) {
         self.sample.clear();
+        self.ray.clear();
         self.pos.clear();
     }
 
-    /// Adds sample number `sample` of the chunk at `p`.
+    /// Adds sample number `sample` of the chunk, of ray number `ray`, at `p` and `time` (0–1 over the video).
     #[inline(always)]
-    pub fn push(&mut self, sample: usize, p: Vec3) {
+    pub fn push(&mut self, sample: usize, ray: usize, p: Vec3, time: f32) {
         let lane = self.sample.len() % TILE;
         if lane == 0 {
-            self.pos.push([[0.5; TILE]; 3]);
+            self.pos.push([[0.5; TILE]; AXES]);
         }
         let tile = self.pos.len() - 1;
         for axis in 0..3 {
             self.pos[tile][axis][lane] = p[axis];
         }
+        self.pos[tile][TIME][lane] = time;
         self.sample.push(sample as u32);
+        self.ray.push(ray as u32);
     }
 
     /// Number of samples.
@@ -116,10 +133,80 @@ impl StreamBatch {
         self.sample.is_empty()
     }
 
-    /// Positions tile by tile, `[axis][lane]`.
-    pub fn tiles(&self) -> &[[[f32; TILE]; 3]] {
+    /// Positions tile by tile.
+    pub fn tiles(&self) -> &[Points] {
         &self.pos
     }
+
+    /// Rays of the lanes of tile `n`.
+    fn rays(&self, n: usize) -> &[u32] {
+        &self.ray[n * TILE..self.len().min((n + 1) * TILE)]
+    }
+
+    /// Number in the chunk and position of every sample.
+    #[inline(always)]
+    pub fn points(&self) -> impl Iterator<Item = (usize, Vec3)> + '_ {
+        let at = |n: usize| Vec3::from_array([0, 1, 2].map(|axis| self.pos[n / TILE][axis][n % TILE]));
+        self.sample.iter().enumerate().map(move |(n, s)| (*s as usize, at(n)))
+    }
+
+    /// The encoding to be made of the samples, level by level: see [`LevelTask::run`].
+    pub fn tasks<'a>(&'a mut self, grid: &'a HashGrid, tables: &'a [Vec<Row>]) -> Vec<LevelTask<'a>> {
+        let Self { sample, pos, levels, slopes, .. } = self;
+        levels.resize_with(grid.levels.len(), LevelRows::default);
+        let parts = grid.levels.iter().zip(tables).zip(levels);
+        parts
+            .map(|((level, table), out)| LevelTask {
+                level,
+                table,
+                pos,
+                lanes: sample.len(),
+                slopes: *slopes,
+                out,
+            })
+            .collect()
+    }
+}
+
+/// The encoding of one batch on one level.
+///
+/// Whoever has many batches does one level of all of them before the next: a level's table fits a core's L2, all of
+/// them together do not.
+pub struct LevelTask<'a> {
+    level: &'a Level,
+    table: &'a [Row],
+    pos: &'a [Points],
+    lanes: usize,
+    slopes: bool,
+    out: &'a mut LevelRows,
+}
+
+impl LevelTask<'_> {
+    /// Looks up and interpolates.
+    #[inline(always)]
+    pub fn run(self) {
+        let Self { level, table, pos, lanes, slopes, out } = self;
+        out.rows.resize(pos.len() * TILE, Row::ZERO);
+        out.rows[lanes..].fill(Row::ZERO);
+        let tiles = pos.iter().zip(out.rows[..lanes].chunks_mut(TILE));
+        if slopes {
+            out.slopes.resize(pos.len() * TILE, [Row::ZERO; 3]);
+            for ((pos, rows), slopes) in tiles.zip(out.slopes.chunks_mut(TILE)) {
+                level.encode_with_slopes(table, pos, rows, slopes);
+            }
+        } else {
+            for (pos, rows) in tiles {
+                level.encode(table, pos, rows);
+            }
+        }
+    }
+}
+
+/// Activations of one stream's networks over the samples of a chunk.
+#[derive(Default)]
+pub struct StreamActivations {
+    trunk: Activations,
+    head: Activations,
 }
 
 impl StreamNet {
@@ -133,39 +220,42 @@ impl StreamNet {
         Self { grid, trunk, head, code, view, density_bias: bias }
     }
 
-    /// Floats of one tile's activations.
-    fn stride(&self) -> usize {
-        (self.trunk.rows() + self.head.rows()) * TILE
+    /// Encodes all samples of `batch`.
+    #[inline(always)]
+    pub fn encode(&self, w: &StreamWeights, batch: &mut StreamBatch) {
+        for task in batch.tasks(&self.grid, w.tables) {
+            task.run();
+        }
     }
 
-    /// Evaluates all samples of `batch`; `code` and `view` give the conditioning of a sample of the chunk.
+    /// Evaluates all samples of an encoded `batch`; `code` and `view` give the conditioning of a ray.
     #[inline(always)]
+    #[allow(clippy::too_many_arguments)]
     pub fn forward<'c, S: Simd>(
         &self,
         simd: S,
         w: &StreamWeights,
-        batch: &mut StreamBatch,
-        code: impl Fn(u32) -> &'c [f32],
-        view: impl Fn(u32) -> &'c [f32],
+        batch: &StreamBatch,
+        activations: &mut StreamActivations,
+        code: impl Fn(usize) -> &'c [f32],
+        view: impl Fn(usize) -> &'c [f32],
         out: &mut StreamSamples,
     ) {
-        let stride = self.stride();
-        batch.tiles.reserve_len(batch.pos.len() * stride);
-        for (n, pos) in batch.pos.iter().enumerate() {
-            let lanes = &batch.sample[n * TILE..batch.sample.len().min((n + 1) * TILE)];
-            let tile = &mut batch.tiles[n * stride..][..stride];
-            let (trunk, head) = tile.split_at_mut(self.trunk.rows() * TILE);
-            self.grid.encode(w.tables, pos, &mut trunk[..self.grid.width() * TILE]);
-            condition(&mut trunk[self.grid.width() * TILE..], self.code, lanes, &code);
-            self.trunk.forward(simd, w.trunk, trunk);
-            let geometry = &trunk[self.trunk.output_row() * TILE..];
-            head[..GEOMETRY * TILE].copy_from_slice(geometry);
-            condition(&mut head[GEOMETRY * TILE..], self.view, lanes, &view);
-            self.head.forward(simd, w.head, head);
+        let unit = Unit::detect();
+        let StreamActivations { trunk, head } = activations;
+        self.trunk.reserve(w.trunk, batch.pos.len(), trunk);
+        self.head.reserve(w.head, batch.pos.len(), head);
+        for (n, lanes) in batch.sample.chunks(TILE).enumerate() {
+            self.trunk_forward(simd, &unit, w, batch, n, trunk, n, &code);
+            let geometry = trunk.output(n);
+            let input = head.input(n);
+            input[..GEOMETRY * TILE].copy_from_slice(geometry);
+            condition(&mut input[GEOMETRY * TILE..], self.view, batch.rays(n), &view);
+            self.head.forward(simd, &unit, w.head, head, n);
             let mut raw = [[0.0; TILE]; 5];
             raw[0].copy_from_slice(&geometry[..TILE]);
-            for (k, raw) in raw[1..].iter_mut().enumerate() {
-                raw.copy_from_slice(&head[(self.head.output_row() + k) * TILE..][..TILE]);
+            for (raw, row) in raw[1..].iter_mut().zip(head.output(n).chunks_exact(TILE)) {
+                raw.copy_from_slice(row);
             }
             for v in &mut raw[0] {
                 *v = simd::exp((*v + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
@@ -184,35 +274,62 @@ impl StreamNet {
         }
     }
 
-    /// Densities alone of all samples of `batch`, in lane order; colours and uncertainty are not computed.
+    /// Densities alone of all samples of an encoded `batch`, in lane order; colours and uncertainty are not computed.
     #[inline(always)]
     pub fn density<'c, S: Simd>(
         &self,
         simd: S,
         w: &StreamWeights,
-        batch: &mut StreamBatch,
-        code: impl Fn(u32) -> &'c [f32],
+        batch: &StreamBatch,
+        activations: &mut StreamActivations,
+        code: impl Fn(usize) -> &'c [f32],
         out: &mut [f32],
     ) {
-        batch.tiles.reserve_len(self.stride());
-        for (n, pos) in batch.pos.iter().enumerate() {
-            let lanes = &batch.sample[n * TILE..batch.sample.len().min((n + 1) * TILE)];
-            let trunk = &mut batch.tiles[..self.trunk.rows() * TILE];
-            self.grid.encode(w.tables, pos, &mut trunk[..self.grid.width() * TILE]);
-            condition(&mut trunk[self.grid.width() * TILE..], self.code, lanes, &code);
-            self.trunk.forward(simd, w.trunk, trunk);
-            let raw = &trunk[self.trunk.output_row() * TILE..];
-            for (o, r) in out[n * TILE..].iter_mut().zip(&raw[..lanes.len()]) {
+        let unit = Unit::detect();
+        let trunk = &mut activations.trunk;
+        self.trunk.reserve(w.trunk, 1, trunk);
+        for (n, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
+            self.trunk_forward(simd, &unit, w, batch, n, trunk, 0, &code);
+            for (o, r) in out.iter_mut().zip(trunk.output(0)) {
                 *o = simd::exp((*r + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
             }
         }
     }
 
-    /// Back-propagates through the evaluation that [`Self::forward`] left in `batch`.
+    /// The trunk on tile `tile` of a batch, as tile `n` of the activations.
+    #[inline(always)]
+    #[allow(clippy::too_many_arguments)]
+    fn trunk_forward<'c, S: Simd>(
+        &self,
+        simd: S,
+        unit: &Unit,
+        w: &StreamWeights,
+        batch: &StreamBatch,
+        tile: usize,
+        trunk: &mut Activations,
+        n: usize,
+        code: &impl Fn(usize) -> &'c [f32],
+    ) {
+        let (features, rest) = trunk.input(n).split_at_mut(self.grid.width() * TILE);
+        for (level, out) in batch.levels.iter().zip(features.chunks_exact_mut(FEATURES * TILE)) {
+            let rows = &level.rows[tile * TILE..][..TILE];
+            for lane in 0..TILE {
+                let row = rows[lane].to_array();
+                for k in 0..FEATURES {
+                    out[k * TILE + lane] = row[k];
+                }
+            }
+        }
+        condition(rest, self.code, batch.rays(tile), code);
+        self.trunk.forward(simd, unit, w.trunk, trunk, n);
+    }
+
+    /// Back-propagates through the evaluation that [`Self::forward`] left in `activations`.
     ///
     /// `values` are its outputs, `grad` the loss's gradient with respect to them. Adds the parameter gradients of trunk
-    /// and head to `trunk_grad` and `head_grad`. The gradients of encoding, code and position stay in the batch:
-    /// see [`Self::encoding_gradient`], [`Self::code_gradient`] and [`Self::position_gradient`].
+    /// and head to `trunk_grad` and `head_grad`, replaces the encoding in `batch` by the gradient with respect to it,
+    /// and calls `code(ray, component, gradient)` for every run of lanes of a ray and, if the batch has slopes,
+    /// `position(ray, sample, gradient)` for every lane.
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
     pub fn backward<S: Simd>(
@@ -220,18 +337,17 @@ impl StreamNet {
         simd: S,
         w: &StreamWeights,
         batch: &mut StreamBatch,
+        activations: &mut StreamActivations,
         values: &StreamSamples,
         grad: &StreamSamples,
-        trunk_grad: &mut [f32],
-        head_grad: &mut [f32],
+        [trunk_grad, head_grad]: [&mut [f32]; 2],
+        mut code: impl FnMut(usize, usize, f32),
+        mut position: impl FnMut(usize, usize, Vec3),
     ) {
-        let stride = self.stride();
-        let count = batch.pos.len();
-        batch.grads.reserve_len(count * stride);
-        for n in 0..count {
-            let lanes = &batch.sample[n * TILE..batch.sample.len().min((n + 1) * TILE)];
-            let (trunk, head) = batch.tiles[n * stride..][..stride].split_at(self.trunk.rows() * TILE);
-            let (dtrunk, dhead) = batch.grads[n * stride..][..stride].split_at_mut(self.trunk.rows() * TILE);
+        let unit = Unit::detect();
+        let StreamActivations { trunk, head } = activations;
+        let StreamBatch { sample, ray, levels, slopes, .. } = batch;
+        for (n, (lanes, rays)) in sample.chunks(TILE).zip(ray.chunks(TILE)).enumerate() {
             let mut raw = [[0.0; TILE]; 5];
             for (lane, &s) in lanes.iter().enumerate() {
                 let s = s as usize;
@@ -242,77 +358,66 @@ impl StreamNet {
                 }
                 raw[4][lane] = grad.beta[s] * values.beta[s] * (1.0 - values.beta[s] / BETA_MAX);
             }
-            let out = self.head.output_row() * TILE;
-            for (k, raw) in raw[1..].iter().enumerate() {
-                dhead[out + k * TILE..][..TILE].copy_from_slice(raw);
+            for (out, raw) in head.output_grad(n).chunks_exact_mut(TILE).zip(&raw[1..]) {
+                out.copy_from_slice(raw);
             }
-            self.head.backward(simd, w.head, head, dhead, true);
-            let out = self.trunk.output_row() * TILE;
-            dtrunk[out..].copy_from_slice(&dhead[..GEOMETRY * TILE]);
-            for (d, raw) in dtrunk[out..][..TILE].iter_mut().zip(&raw[0]) {
+            self.head.backward(simd, &unit, w.head, head, n);
+            let out = trunk.output_grad(n);
+            out.copy_from_slice(&head.input_grad(n)[..GEOMETRY * TILE]);
+            for (d, raw) in out.iter_mut().zip(&raw[0]) {
                 *d += raw;
             }
-            self.trunk.backward(simd, w.trunk, trunk, dtrunk, true);
-        }
-        let view = |data, row: usize| TileView { data, stride, offset: row * TILE };
-        let rows = self.trunk.rows();
-        self.trunk.accumulate(simd, view(&batch.tiles, 0), view(&batch.grads, 0), count, trunk_grad);
-        self.head.accumulate(simd, view(&batch.tiles, rows), view(&batch.grads, rows), count, head_grad);
-    }
-
-    /// The gradient of the encoding, level-major `out[level * capacity + lane]`.
-    #[inline(always)]
-    pub fn encoding_gradient(&self, batch: &StreamBatch, capacity: usize, out: &mut [Row]) {
-        let stride = self.stride();
-        for (level, out) in out.chunks_exact_mut(capacity).take(self.grid.levels.len()).enumerate() {
-            for (n, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
-                let g = &batch.grads[n * stride + level * FEATURES * TILE..][..FEATURES * TILE];
-                for (lane, row) in out.iter_mut().enumerate() {
-                    *row = Row::new(g[lane], g[TILE + lane], g[2 * TILE + lane], g[3 * TILE + lane]);
+            self.trunk.backward(simd, &unit, w.trunk, trunk, n);
+            let (features, rest) = trunk.input_grad(n).split_at(self.grid.width() * TILE);
+            for (level, g) in levels.iter_mut().zip(features.chunks_exact(FEATURES * TILE)) {
+                let rows = &mut level.rows[n * TILE..][..TILE];
+                for lane in 0..TILE {
+                    rows[lane] = Row::new(g[lane], g[TILE + lane], g[2 * TILE + lane], g[3 * TILE + lane]);
+                }
+            }
+            for (ray, run) in runs(rays) {
+                for (k, row) in rest.chunks_exact(TILE).take(self.code).enumerate() {
+                    code(ray, k, row[run.clone()].iter().sum());
+                }
+            }
+            if *slopes {
+                for (lane, s) in lanes.iter().enumerate() {
+                    let mut sum = Vec3::ZERO;
+                    for level in levels.iter() {
+                        let (g, [x, y, z]) = (level.rows[n * TILE + lane], level.slopes[n * TILE + lane]);
+                        sum += Vec3::new(g.dot(x), g.dot(y), g.dot(z));
+                    }
+                    position(rays[lane] as usize, *s as usize, sum);
                 }
             }
         }
+        let tiles = sample.len().div_ceil(TILE);
+        self.trunk.accumulate(simd, &unit, w.trunk, trunk, tiles, trunk_grad);
+        self.head.accumulate(simd, &unit, w.head, head, tiles, head_grad);
     }
+}
 
-    /// Calls `add(sample, component, gradient)` for the gradient of every lane's code.
-    #[inline(always)]
-    pub fn code_gradient(&self, batch: &StreamBatch, mut add: impl FnMut(u32, usize, f32)) {
-        let stride = self.stride();
-        for (n, lanes) in batch.sample.chunks(TILE).enumerate() {
-            for k in 0..self.code {
-                let row = &batch.grads[n * stride + (self.grid.width() + k) * TILE..][..TILE];
-                for (s, g) in lanes.iter().zip(row) {
-                    add(*s, k, *g);
-                }
-            }
-        }
+/// Fills the conditioning rows of a tile, ray by ray.
+#[inline(always)]
+fn condition<'c>(rows: &mut [f32], width: usize, rays: &[u32], of: impl Fn(usize) -> &'c [f32]) {
+    if width == 0 {
+        return;
     }
-
-    /// Calls `add(sample, gradient)` for the gradient of every lane's position.
-    #[inline(always)]
-    pub fn position_gradient(&self, w: &StreamWeights, batch: &StreamBatch, mut add: impl FnMut(u32, Vec3)) {
-        let stride = self.stride();
-        for (n, (lanes, pos)) in batch.sample.chunks(TILE).zip(&batch.pos).enumerate() {
-            let grad = &batch.grads[n * stride..][..self.grid.width() * TILE];
-            let d = self.grid.position_gradient(w.tables, pos, grad);
-            for (lane, s) in lanes.iter().enumerate() {
-                add(*s, Vec3::new(d[0][lane], d[1][lane], d[2][lane]));
-            }
+    for (ray, run) in runs(rays) {
+        for (row, v) in rows.chunks_exact_mut(TILE).zip(&of(ray)[..width]) {
+            row[run.clone()].fill(*v);
         }
     }
 }
 
-/// Fills the conditioning rows of a tile lane by lane.
+/// Rays of a tile, and the lanes that each has there.
 #[inline(always)]
-fn condition<'c>(rows: &mut [f32], width: usize, lanes: &[u32], of: impl Fn(u32) -> &'c [f32]) {
-    if width == 0 {
-        return;
-    }
-    for (lane, &s) in lanes.iter().enumerate() {
-        for (k, v) in of(s)[..width].iter().enumerate() {
-            rows[k * TILE + lane] = *v;
-        }
-    }
+fn runs(rays: &[u32]) -> impl Iterator<Item = (usize, Range<usize>)> + '_ {
+    let mut start = 0;
+    rays.chunk_by(|a, b| a == b).map(move |run| {
+        start += run.len();
+        (run[0] as usize, start - run.len()..start)
+    })
 }
 
 /// Where one stream's dense parameters are in the field's flat weight vector.

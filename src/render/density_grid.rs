@@ -2,6 +2,11 @@
 
 use glam::{UVec3, Vec3};
 
+use crate::simd::floor_within;
+
+/// Points that are looked up together.
+pub const STRIDE: usize = 16;
+
 /// Running mean of recent densities on a lattice of cells over `[0, extent]`, in one or more slices of time.
 #[derive(Clone, Debug)]
 pub struct DensityGrid {
@@ -39,11 +44,27 @@ impl DensityGrid {
     #[inline(always)]
     pub fn index(&self, p: Vec3, slice: usize) -> usize {
         let q = p * self.per_unit;
-        // `as u32` saturates at 0 for negative numbers and NaN.
-        let x = (q.x as u32).min(self.dims.x - 1) as usize;
-        let y = (q.y as u32).min(self.dims.y - 1) as usize;
-        let z = (q.z as u32).min(self.dims.z - 1) as usize;
-        ((slice * self.dims.z as usize + z) * self.dims.y as usize + y) * self.dims.x as usize + x
+        let cell = |x: f32, dim: u32| floor_within(x, (dim - 1) as f32).0;
+        let (x, y, z) = (cell(q.x, self.dims.x), cell(q.y, self.dims.y), cell(q.z, self.dims.z));
+        ((slice as u32 * self.dims.z + z) * self.dims.y + y) as usize * self.dims.x as usize + x as usize
+    }
+
+    /// Adds the σ of the cells that hold `points` (x, y, z rows) to `out`.
+    #[inline(always)]
+    pub fn add_at(&self, points: &[[f32; STRIDE]; 3], slice: usize, out: &mut [f32; STRIDE]) {
+        let mut index = [0u32; STRIDE];
+        let (dims, per_unit) = (self.dims, self.per_unit);
+        for n in 0..STRIDE {
+            let (x, _) = floor_within(points[0][n] * per_unit.x, (dims.x - 1) as f32);
+            let (y, _) = floor_within(points[1][n] * per_unit.y, (dims.y - 1) as f32);
+            let (z, _) = floor_within(points[2][n] * per_unit.z, (dims.z - 1) as f32);
+            index[n] = (z * dims.y + y) * dims.x + x;
+        }
+        let cells = dims.as_usizevec3().element_product();
+        let sigma = &self.sigma[slice * cells..][..cells];
+        for (out, n) in out.iter_mut().zip(index) {
+            *out += sigma[n as usize];
+        }
     }
 
     /// σ of the cell that holds `p`.

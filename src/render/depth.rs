@@ -5,7 +5,7 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::composite::{self, Interval, Weighted};
-use super::forward::{Chunk, Model, RayInput};
+use super::forward::{Chunk, Model, RayInput, Tracer};
 use super::rays::{View, pixel_directions};
 use super::refined::{reduced, refined_camera};
 use super::sampler::Sampling;
@@ -96,11 +96,11 @@ impl WithSimd for DepthPass<'_> {
     fn with_simd<S: Simd>(self, simd: S) -> Vec<Traced> {
         let Self { model, stream, views, inputs, sampling, spread } = self;
         let n = sampling.count;
-        let mut chunk = Chunk::default();
+        let (mut chunk, mut tracer) = (Chunk::default(), Tracer::default());
         let mut alone = vec![Weighted::default(); n];
         let mut out = Vec::with_capacity(inputs.len());
         for inputs in inputs.chunks(CHUNK_RAYS) {
-            chunk.densities(simd, model, views, inputs, sampling);
+            chunk.densities(simd, &mut tracer, model, views, inputs, sampling);
             for r in 0..inputs.len() {
                 let range = r * n..(r + 1) * n;
                 out.push(trace(

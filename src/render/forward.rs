@@ -6,11 +6,11 @@ use glam::{Vec2, Vec3};
 use pulp::Simd;
 
 use super::composite::{self, Interval, Weighted};
-use super::density_grid::DensityGrid;
+use super::density_grid::{DensityGrid, STRIDE};
 use super::rays::{Ray, View};
-use super::sampler::{Sampler, Sampling};
-use crate::field::mlp::Packed;
-use crate::field::stream::{StreamBatch, StreamSamples, StreamWeights};
+use super::sampler::{Sampler, Sampling, Steer};
+use crate::field::mlp::{Packed, Precision};
+use crate::field::stream::{StreamActivations, StreamBatch, StreamSamples, StreamWeights};
 use crate::field::{Field, Stream, VIEW, view_encoding};
 
 /// Running densities of the three streams. The actor's is over (u, v, inverse depth) in the camera's frustum.
@@ -67,14 +67,24 @@ pub struct Model<'a> {
 }
 
 impl<'a> Model<'a> {
-    /// Packs the weights of the streams that the field has and that `streams` asks for.
+    /// Packs the weights of the streams that the field has and that `streams` asks for; evaluates in f32.
     pub fn new(field: &'a Field, grids: &'a Grids, streams: [bool; 3]) -> Self {
+        Self::with_precision(field, grids, streams, Precision::F32)
+    }
+
+    /// As [`Self::new`], with the networks multiplied in `precision`.
+    pub fn with_precision(
+        field: &'a Field,
+        grids: &'a Grids,
+        streams: [bool; 3],
+        precision: Precision,
+    ) -> Self {
         let packed = Stream::ALL.map(|s| {
             let net = field.net(s)?;
             let r = &field.layout.streams[s as usize];
             Some((
-                net.trunk.pack(&field.weights[r.trunk.clone()]),
-                net.head.pack(&field.weights[r.head.clone()]),
+                net.trunk.pack(&field.weights[r.trunk.clone()], precision),
+                net.head.pack(&field.weights[r.head.clone()], precision),
             ))
         });
         let streams = std::array::from_fn(|s| streams[s] && field.nets[s].is_some());
@@ -92,6 +102,42 @@ impl<'a> Model<'a> {
     pub fn actor_point(&self, uv: Vec2, z: f32) -> Vec3 {
         let (near, far) = (self.field.near * 0.5, self.field.actor_far);
         uv.extend(((1.0 - near / z.max(near)) / (1.0 - near / far)).min(1.0))
+    }
+}
+
+/// The density grids along one ray.
+struct RayGrids<'a> {
+    model: &'a Model<'a>,
+    input: &'a RayInput,
+    /// Slice of time of each grid.
+    slices: [usize; 3],
+}
+
+impl Steer for RayGrids<'_> {
+    #[inline(always)]
+    fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
+        let Self { model, input, slices } = *self;
+        let [persistent, dynamic, actor] = &model.grids.streams;
+        let mut sum = [0.0; STRIDE];
+        if model.streams[0] {
+            persistent.add_at(points, slices[0], &mut sum);
+        }
+        if model.streams[1] {
+            dynamic.add_at(points, slices[1], &mut sum);
+        }
+        let (z, far) = (input.dir_cam.z, model.field.actor_far);
+        if model.streams[2] && t[0] * z < far {
+            let mut points = [[input.uv.x; STRIDE], [input.uv.y; STRIDE], [0.0; STRIDE]];
+            for n in 0..STRIDE {
+                points[2][n] = model.actor_point(input.uv, t[n] * z).z;
+            }
+            let mut sigma = [0.0; STRIDE];
+            actor.add_at(&points, slices[2], &mut sigma);
+            for n in 0..STRIDE {
+                sum[n] += if t[n] * z < far { sigma[n] } else { 0.0 };
+            }
+        }
+        sum
     }
 }
 
@@ -123,11 +169,21 @@ pub struct TracedRay {
     view: [f32; VIEW],
 }
 
-/// Buffers of one chunk; everything that the backward pass needs again.
+/// Buffers of one thread, used for one chunk after the other.
 #[derive(Default)]
-pub struct Chunk {
+pub struct Tracer {
     sampler: Sampler,
     edges: Vec<f32>,
+    /// What the networks of each stream left for the way back.
+    pub activations: [StreamActivations; 3],
+}
+
+/// One chunk of rays: its samples and what the streams said about them.
+///
+/// Tracing has three steps, which training takes for all chunks together: [`Self::place`], the encoding of
+/// [`Self::batches`], [`Self::evaluate`].
+#[derive(Default)]
+pub struct Chunk {
     codes: [Vec<f32>; 3],
     /// The rays in order.
     pub rays: Vec<TracedRay>,
@@ -135,7 +191,7 @@ pub struct Chunk {
     pub intervals: Vec<Interval>,
     /// `[rays * count]`.
     pub weighted: Vec<Weighted>,
-    /// Which samples each stream was evaluated at.
+    /// Which samples each stream is evaluated at.
     pub batches: [StreamBatch; 3],
     /// What each stream said; zero where it was not evaluated.
     pub samples: [StreamSamples; 3],
@@ -147,13 +203,62 @@ impl Chunk {
     pub fn forward<S: Simd>(
         &mut self,
         simd: S,
+        tracer: &mut Tracer,
+        model: &Model,
+        views: &[View],
+        inputs: &[RayInput],
+        sampling: &Sampling,
+    ) {
+        self.place(tracer, model, views, inputs, sampling);
+        self.encode(model);
+        self.evaluate(simd, tracer, model, sampling.count);
+    }
+
+    /// As [`Self::forward`], but densities and weights alone: colours and uncertainty are not computed.
+    #[inline(always)]
+    pub fn densities<S: Simd>(
+        &mut self,
+        simd: S,
+        tracer: &mut Tracer,
         model: &Model,
         views: &[View],
         inputs: &[RayInput],
         sampling: &Sampling,
     ) {
         let n = sampling.count;
-        self.place_samples(model, views, inputs, sampling);
+        self.place(tracer, model, views, inputs, sampling);
+        self.encode(model);
+        let Self { codes, rays, intervals, weighted, batches, samples, .. } = self;
+        for (s, samples) in samples.iter_mut().enumerate() {
+            let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
+            let sigma = &mut samples.sigma;
+            sigma.clear();
+            sigma.resize(batches[s].len(), 0.0);
+            let code = |r: usize| &codes[s][r * net.code..];
+            net.density(simd, &w, &batches[s], &mut tracer.activations[s], code, sigma);
+            for (&k, sigma) in batches[s].sample.iter().zip(sigma) {
+                intervals[k as usize].sigma[s] = *sigma;
+            }
+        }
+        weighted.resize(intervals.len(), Weighted::default());
+        for (r, ray) in rays.iter_mut().enumerate() {
+            let range = r * n..(r + 1) * n;
+            ray.left = composite::weights(&intervals[range.clone()], &mut weighted[range]);
+        }
+    }
+
+    #[inline(always)]
+    fn encode(&mut self, model: &Model) {
+        for (s, batch) in self.batches.iter_mut().enumerate() {
+            if let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) {
+                net.encode(&w, batch);
+            }
+        }
+    }
+
+    /// Evaluates the streams at the placed and encoded samples, `n` a ray, and composites.
+    #[inline(always)]
+    pub fn evaluate<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, n: usize) {
         let Self { codes, rays, intervals, weighted, batches, samples, .. } = self;
         for s in 0..3 {
             samples[s].reset(intervals.len());
@@ -161,9 +266,9 @@ impl Chunk {
             if batches[s].is_empty() {
                 continue;
             }
-            let code = |k: u32| &codes[s][k as usize / n * net.code..];
-            let view = |k: u32| &rays[k as usize / n].view[..];
-            net.forward(simd, &w, &mut batches[s], code, view, &mut samples[s]);
+            let code = |r: usize| &codes[s][r * net.code..];
+            let view = |r: usize| &rays[r].view[..];
+            net.forward(simd, &w, &batches[s], &mut tracer.activations[s], code, view, &mut samples[s]);
             for (i, sigma) in intervals.iter_mut().zip(&samples[s].sigma) {
                 i.sigma[s] = *sigma;
             }
@@ -188,45 +293,23 @@ impl Chunk {
         }
     }
 
-    /// As [`Self::forward`], but densities and weights alone: colours and uncertainty are not computed.
+    /// Places the samples of `inputs`, and decides which streams are evaluated at each.
     #[inline(always)]
-    pub fn densities<S: Simd>(
+    pub fn place(
         &mut self,
-        simd: S,
+        tracer: &mut Tracer,
         model: &Model,
         views: &[View],
         inputs: &[RayInput],
         sampling: &Sampling,
     ) {
-        let n = sampling.count;
-        self.place_samples(model, views, inputs, sampling);
-        let Self { codes, rays, intervals, weighted, batches, samples, .. } = self;
-        for (s, samples) in samples.iter_mut().enumerate() {
-            let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
-            let sigma = &mut samples.sigma;
-            sigma.clear();
-            sigma.resize(batches[s].len(), 0.0);
-            let code = |k: u32| &codes[s][k as usize / n * net.code..];
-            net.density(simd, &w, &mut batches[s], code, sigma);
-            for (&k, sigma) in batches[s].sample.iter().zip(sigma) {
-                intervals[k as usize].sigma[s] = *sigma;
-            }
-        }
-        weighted.resize(intervals.len(), Weighted::default());
-        for (r, ray) in rays.iter_mut().enumerate() {
-            let range = r * n..(r + 1) * n;
-            ray.left = composite::weights(&intervals[range.clone()], &mut weighted[range]);
-        }
-    }
-
-    #[inline(always)]
-    fn place_samples(&mut self, model: &Model, views: &[View], inputs: &[RayInput], sampling: &Sampling) {
+        let Tracer { sampler, edges, .. } = tracer;
         let n = sampling.count;
         let field = model.field;
         let [grid_p, grid_d, grid_a] = &model.grids.streams;
         self.rays.clear();
         self.intervals.clear();
-        self.edges.resize(n + 1, 0.0);
+        edges.resize(n + 1, 0.0);
         for b in &mut self.batches {
             b.clear();
         }
@@ -244,43 +327,30 @@ impl Chunk {
                 }
             }
             let (slice_d, slice_a) = (grid_d.slice(view.time), grid_a.slice(view.time));
-            let sigma = |p: Vec3, t: f32| {
-                let mut sum = 0.0;
-                if model.streams[0] {
-                    sum += grid_p.at(p, 0);
-                }
-                if model.streams[1] {
-                    sum += grid_d.at(p, slice_d);
-                }
-                let z = t * input.dir_cam.z;
-                if model.streams[2] && z < field.actor_far {
-                    sum += grid_a.at(model.actor_point(input.uv, z), slice_a);
-                }
-                sum
-            };
-            let hit = self.sampler.edges(&ray, sampling, input.jitter, sigma, &mut self.edges);
+            let steer = RayGrids { model, input, slices: [0, slice_d, slice_a] };
+            let hit = sampler.edges(&ray, sampling, input.jitter, &steer, edges);
             for k in 0..n {
                 let sample = r * n + k;
                 if !hit {
                     self.intervals.push(Interval::default());
                     continue;
                 }
-                let t = 0.5 * (self.edges[k] + self.edges[k + 1]);
-                let delta = self.edges[k + 1] - self.edges[k];
+                let t = 0.5 * (edges[k] + edges[k + 1]);
+                let delta = edges[k + 1] - edges[k];
                 self.intervals.push(Interval { sigma: [0.0; 3], delta, t });
                 let p = ray.origin + ray.dir * t;
                 let threshold = &model.grids.threshold;
                 if model.streams[0] && grid_p.at(p, 0) >= threshold[0] {
-                    self.batches[0].push(sample, p);
+                    self.batches[0].push(sample, r, p, view.time);
                 }
                 if model.streams[1] && grid_d.at(p, slice_d) >= threshold[1] {
-                    self.batches[1].push(sample, p);
+                    self.batches[1].push(sample, r, p, view.time);
                 }
                 let z = t * input.dir_cam.z;
                 if model.streams[2] && z < field.actor_far {
                     let q = model.actor_point(input.uv, z);
                     if grid_a.at(q, slice_a) >= threshold[2] {
-                        self.batches[2].push(sample, q);
+                        self.batches[2].push(sample, r, q, view.time);
                     }
                 }
             }

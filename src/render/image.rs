@@ -4,7 +4,7 @@ use glam::Vec2;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::forward::{Chunk, Model, RayInput};
+use super::forward::{Chunk, Model, RayInput, Tracer};
 use super::rays::{View, pixel_directions};
 use super::sampler::Sampling;
 use crate::scene::Frame;
@@ -82,10 +82,10 @@ impl WithSimd for RenderPass<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Vec<Pixel> {
         let Self { model, views, inputs, sampling, exposure } = self;
-        let mut chunk = Chunk::default();
+        let (mut chunk, mut tracer) = (Chunk::default(), Tracer::default());
         let mut out = Vec::with_capacity(inputs.len());
         for inputs in inputs.chunks(CHUNK_RAYS) {
-            chunk.forward(simd, model, views, inputs, sampling);
+            chunk.forward(simd, &mut tracer, model, views, inputs, sampling);
             for r in 0..inputs.len() {
                 out.push(pixel(&chunk, r, sampling.count, model, exposure));
             }

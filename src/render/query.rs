@@ -4,7 +4,7 @@ use glam::Vec3;
 use pulp::{Simd, WithSimd};
 
 use super::forward::Model;
-use crate::field::stream::{StreamBatch, StreamNet, StreamSamples, StreamWeights};
+use crate::field::stream::{StreamActivations, StreamBatch, StreamNet, StreamSamples, StreamWeights};
 use crate::field::{Stream, view_encoding};
 
 /// One stream of a model at one time.
@@ -15,6 +15,7 @@ pub struct Query<'a> {
     stream: Stream,
     net: &'a StreamNet,
     code: Vec<f32>,
+    time: f32,
     /// Slice of the density grid.
     slice: usize,
 }
@@ -30,7 +31,7 @@ impl<'a> Query<'a> {
             trajectory.evaluate(gamma, trajectory.locate(time), &mut code);
         }
         let slice = model.grids.streams[stream as usize].slice(time);
-        Some(Self { model, stream, net, code, slice })
+        Some(Self { model, stream, net, code, time, slice })
     }
 
     /// Which stream is asked.
@@ -45,7 +46,7 @@ impl<'a> Query<'a> {
         out.fill(0.0);
         let mut batch = StreamBatch::default();
         for (n, p) in points.iter().enumerate().filter(|(_, p)| grid.at(**p, self.slice) >= threshold) {
-            batch.push(n, *p);
+            batch.push(n, 0, *p, self.time);
         }
         let Some(weights) = self.model.weights(s) else { return };
         if batch.is_empty() {
@@ -64,7 +65,7 @@ impl<'a> Query<'a> {
     pub fn colours(&self, points: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
         let Some(weights) = self.model.weights(self.stream as usize) else { return Vec::new() };
         let mut batch = StreamBatch::default();
-        points.iter().enumerate().for_each(|(n, p)| batch.push(n, *p));
+        points.iter().enumerate().for_each(|(n, p)| batch.push(n, n, *p, self.time));
         let views: Vec<_> = directions.iter().map(|d| view_encoding(*d)).collect();
         let mut out = StreamSamples::default();
         out.reset(points.len());
@@ -88,8 +89,10 @@ impl WithSimd for DensityPass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let code = |_: u32| &self.query.code[..];
-        self.query.net.density(simd, &self.weights, self.batch, code, self.out);
+        let code = |_: usize| &self.query.code[..];
+        let mut activations = StreamActivations::default();
+        self.query.net.encode(&self.weights, self.batch);
+        self.query.net.density(simd, &self.weights, self.batch, &mut activations, code, self.out);
     }
 }
 
@@ -106,9 +109,11 @@ impl WithSimd for ColourPass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let code = |_: u32| &self.query.code[..];
+        let code = |_: usize| &self.query.code[..];
         let views = self.views;
-        let view = |n: u32| &views[n as usize][..];
-        self.query.net.forward(simd, &self.weights, self.batch, code, view, self.out);
+        let view = |n: usize| &views[n][..];
+        let mut activations = StreamActivations::default();
+        self.query.net.encode(&self.weights, self.batch);
+        self.query.net.forward(simd, &self.weights, self.batch, &mut activations, code, view, self.out);
     }
 }

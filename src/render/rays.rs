@@ -29,8 +29,8 @@ pub struct View {
     pub rotation: Mat3,
     /// Small rotation (rad) and translation (units) in camera axes.
     pub refinement: [f32; 6],
-    /// Relative change of the focal length.
-    pub focal: f32,
+    /// Relative change of the focal length, and of its growth with the squared distance from the axis.
+    pub lens: [f32; 2],
     /// Place in the pose and exposure trajectories.
     pub knots: Knots,
     /// When it is, in [0, 1] over the video.
@@ -70,7 +70,7 @@ impl View {
             centre: n.to_unit(frame.c2w.translation),
             rotation: frame.c2w.matrix3.as_mat3(),
             refinement,
-            focal: rig[6],
+            lens: [rig[6], rig[7]],
             knots,
             time,
             code_knots: field.codes.each_ref().map(|c| c.as_ref().map(|c| c.locate(time))),
@@ -87,21 +87,29 @@ impl View {
     pub fn ray(&self, dir_cam: Vec3, extent: Vec3, near: f32) -> Ray {
         let [rx, ry, rz, tx, ty, tz] = self.refinement;
         let turned = dir_cam + Vec3::new(rx, ry, rz).cross(dir_cam);
-        let refined_cam = turned + self.focal * Vec3::new(dir_cam.x, dir_cam.y, 0.0);
+        let [focal, radial] = self.lens;
+        let zoom = focal + radial * off_axis(dir_cam);
+        let refined_cam = turned + zoom * Vec3::new(dir_cam.x, dir_cam.y, 0.0);
         let origin = self.centre + self.rotation * Vec3::new(tx, ty, tz);
         let dir = self.rotation * refined_cam;
         Ray { origin, dir, dir_cam, refined_cam, range: clip(origin, dir, extent, near) }
     }
 
-    /// Gradient with respect to (rotation, translation, focal) of a loss with the given gradient with respect to the
-    /// ray's origin and direction.
-    pub fn backward(&self, ray: &Ray, d_origin: Vec3, d_dir: Vec3) -> ([f32; 6], f32) {
+    /// Gradient with respect to (rotation, translation) and the lens of a loss with the given gradient with respect to
+    /// the ray's origin and direction.
+    pub fn backward(&self, ray: &Ray, d_origin: Vec3, d_dir: Vec3) -> ([f32; 6], [f32; 2]) {
         let translation = self.rotation.transpose() * d_origin;
         let d_cam = self.rotation.transpose() * d_dir;
         let rotation = ray.dir_cam.cross(d_cam);
         let focal = d_cam.x * ray.dir_cam.x + d_cam.y * ray.dir_cam.y;
-        ([rotation.x, rotation.y, rotation.z, translation.x, translation.y, translation.z], focal)
+        let pose = [rotation.x, rotation.y, rotation.z, translation.x, translation.y, translation.z];
+        (pose, [focal, focal * off_axis(ray.dir_cam)])
     }
+}
+
+/// Squared distance from the optical axis in the plane at depth 1.
+fn off_axis(dir: Vec3) -> f32 {
+    (dir.x * dir.x + dir.y * dir.y) / (dir.z * dir.z)
 }
 
 /// The part of a ray inside `[0, extent]` and beyond `near`; empty (start ≥ end) if it misses the box.

@@ -21,8 +21,11 @@ pub fn refined_camera(field: &Field, frame: &Frame) -> (Camera, Pose) {
     };
     // Directions are stretched by `zoom` off the axis, so the same pixel belongs to a longer focal length's inverse;
     // the lens polynomial is in normalised coordinates and is rescaled with them.
-    let zoom = 1.0 + f64::from(view.focal);
+    let [focal, radial] = view.lens.map(f64::from);
+    let zoom = 1.0 + focal;
     let [k1, k2, p1, p2] = frame.camera.distortion;
+    // Directions that are stretched by `radial r²` more belong to a lens that pulls them in by as much.
+    let k1 = k1 - radial / zoom;
     let camera = Camera {
         fx: frame.camera.fx / zoom,
         fy: frame.camera.fy / zoom,
@@ -63,7 +66,7 @@ mod tests {
             *w = 1e-3 * ((k * 7 % 5) as f32 - 2.0);
         }
         let rig = field.layout.rig.clone();
-        field.weights[rig][..7].copy_from_slice(&[2e-3, -1e-3, 1e-3, 1e-3, 2e-3, -2e-3, 0.01]);
+        field.weights[rig].copy_from_slice(&[2e-3, -1e-3, 1e-3, 1e-3, 2e-3, -2e-3, 0.01, 0.004]);
         let mut frame = frame(0.3);
         frame.camera.distortion = [0.05, -0.01, 0.002, -0.001];
         let view = View::new(&field, &frame);

@@ -1,7 +1,6 @@
 //! Where along a ray to look: intervals of equal weight under the running density grids.
 
-use glam::Vec3;
-
+use super::density_grid::STRIDE;
 use super::rays::Ray;
 
 /// Most steps a ray takes through the density grids.
@@ -23,6 +22,14 @@ pub struct Sampling {
     pub sharpness: f32,
 }
 
+/// What steers the samples of one ray: the sum of the streams' running densities along it.
+///
+/// A trait and not a closure, which would not be inlined, and so compiled without the caller's vector features.
+pub trait Steer {
+    /// σ at some points of the ray (x, y, z rows) and their distances.
+    fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE];
+}
+
 /// Buffers of one thread.
 pub struct Sampler {
     weights: Vec<f32>,
@@ -37,15 +44,14 @@ impl Default for Sampler {
 impl Sampler {
     /// Writes `count + 1` increasing distances to `edges`; false if the ray misses the box.
     ///
-    /// `grid_sigma(p, t)` is the sum of the streams' running densities. `jitter` in [0, 1) shifts all edges by a part of
-    /// one interval's weight.
+    /// `jitter` in [0, 1) shifts all edges by a part of one interval's weight.
     #[inline(always)]
     pub fn edges(
         &mut self,
         ray: &Ray,
         sampling: &Sampling,
         jitter: f32,
-        grid_sigma: impl Fn(Vec3, f32) -> f32,
+        steer: &impl Steer,
         edges: &mut [f32],
     ) -> bool {
         let (start, end) = ray.range;
@@ -58,14 +64,31 @@ impl Sampler {
         let mut total = 0.0;
         let mut used = 0;
         let scale = sampling.sharpness * dt;
-        for w in &mut self.weights[..steps] {
-            let t = start + (used as f32 + 0.5) * dt;
-            let tau = grid_sigma(ray.origin + ray.dir * t, t) * scale;
-            let alpha = tau / (1.0 + tau); // 1 - e^-tau to first order, and cheaper; only steers the samples
-            *w = left * alpha;
-            total += *w;
-            left *= 1.0 - alpha;
-            used += 1;
+        for weights in self.weights[..steps].chunks_mut(STRIDE) {
+            let mut t = [0.0; STRIDE];
+            for (n, t) in t.iter_mut().enumerate() {
+                *t = start + ((used + n) as f32 + 0.5) * dt;
+            }
+            let mut points = [[0.0; STRIDE]; 3];
+            for axis in 0..3 {
+                for n in 0..STRIDE {
+                    points[axis][n] = ray.origin[axis] + ray.dir[axis] * t[n];
+                }
+            }
+            let mut alpha = steer.sigma(&points, &t);
+            for a in &mut alpha {
+                let tau = *a * scale;
+                *a = tau / (1.0 + tau); // 1 - e^-tau to first order, and cheaper; only steers the samples
+            }
+            for (w, alpha) in weights.iter_mut().zip(alpha) {
+                *w = left * alpha;
+                total += *w;
+                left *= 1.0 - alpha;
+                used += 1;
+                if left < SATURATED {
+                    break;
+                }
+            }
             if left < SATURATED {
                 break;
             }

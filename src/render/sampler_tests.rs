@@ -2,8 +2,9 @@
 
 use glam::Vec3;
 
+use super::density_grid::STRIDE;
 use super::rays::Ray;
-use super::sampler::{Sampler, Sampling};
+use super::sampler::{Sampler, Sampling, Steer};
 use crate::rng::Rng;
 
 const SAMPLING: Sampling = Sampling { count: 24, step: 1.0 / 64.0, explore: 0.2, sharpness: 1.0 };
@@ -12,9 +13,18 @@ fn ray(start: f32, end: f32) -> Ray {
     Ray { origin: Vec3::ZERO, dir: Vec3::X, dir_cam: Vec3::Z, refined_cam: Vec3::Z, range: (start, end) }
 }
 
+/// A density that depends on the distance alone.
+struct Along<F>(F);
+
+impl<F: Fn(f32) -> f32> Steer for Along<F> {
+    fn sigma(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
+        t.map(&self.0)
+    }
+}
+
 fn edges(sampling: &Sampling, range: (f32, f32), jitter: f32, sigma: impl Fn(f32) -> f32) -> Vec<f32> {
     let mut edges = vec![f32::NAN; sampling.count + 1];
-    assert!(Sampler::default().edges(&ray(range.0, range.1), sampling, jitter, |_, t| sigma(t), &mut edges));
+    assert!(Sampler::default().edges(&ray(range.0, range.1), sampling, jitter, &Along(sigma), &mut edges));
     edges
 }
 
@@ -74,5 +84,5 @@ fn extreme_densities_give_finite_edges() {
 #[test]
 fn a_ray_that_misses_the_box_places_nothing() {
     let mut edges = [0.0; 25];
-    assert!(!Sampler::default().edges(&ray(1.0, 1.0), &SAMPLING, 0.5, |_, _| 1.0, &mut edges));
+    assert!(!Sampler::default().edges(&ray(1.0, 1.0), &SAMPLING, 0.5, &Along(|_| 1.0), &mut edges));
 }

@@ -21,9 +21,11 @@ pub(crate) fn field_at(streams: [bool; 3], origin: DVec3) -> Field {
         layers: 1,
         code: 0,
         knots: 0,
+        time_levels: 0,
+        time_finest: 16.0,
         density_bias: -2.0,
     };
-    let moving = StreamConfig { code: 4, knots: 4, ..small.clone() };
+    let moving = StreamConfig { code: 4, knots: 4, time_levels: 2, ..small.clone() };
     let config =
         FieldConfig { persistent: small, dynamic: moving.clone(), actor: moving, ..FieldConfig::default() };
     let mut field = Field::zeros(FieldShape {

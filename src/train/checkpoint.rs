@@ -49,6 +49,10 @@ pub struct TrainingState {
     pub streams_settled: bool,
     /// Share of image blocks that the persistent stream alone could not explain; `None` before it was measured.
     pub unexplained: Option<f64>,
+    /// Pose refinement and rig from which depth was looked for by stereo; `None` before it was.
+    pub stereo_from: Option<Vec<f32>>,
+    /// How many of the due alignments of the frames are done.
+    pub aligned: usize,
 }
 
 #[derive(Serialize, Deserialize)]

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::field::mlp::Precision;
+
 /// Which streams are trained.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -45,6 +47,12 @@ pub struct TrainConfig {
     pub rig_rate: f32,
     /// Fraction of the schedule after which poses and rig are refined.
     pub refine_from: f64,
+    /// Fraction of the schedule after which depth is looked for by stereo; 1: never.
+    pub stereo_at: f64,
+    /// Fractions of the schedule after which all frames are registered to the field; none trusts the poses.
+    pub align_at: Vec<f64>,
+    /// Steps before which the field is too foggy for that.
+    pub align_after: u64,
     /// Cells of the density grids along the longest side of the box.
     pub grid_cells: f32,
     /// How fast the density grids follow, per sample.
@@ -55,6 +63,8 @@ pub struct TrainConfig {
     pub skip_from: f64,
     /// Share of a ray's samples spread evenly at the start, and at the end of the schedule.
     pub explore: [f32; 2],
+    /// What the networks are multiplied in while training.
+    pub precision: Precision,
     /// Seconds between checkpoints.
     pub checkpoint_seconds: f64,
 }
@@ -68,18 +78,22 @@ impl Default for TrainConfig {
             samples: 20,
             render_samples: 48,
             streams: StreamChoice::Auto,
-            static_until: 0.25,
+            static_until: 0.15,
             table_rate: 3e-2,
             network_rate: 2e-3,
             exposure_rate: 1e-3,
             pose_rate: 1e-4,
             rig_rate: 1e-4,
             refine_from: 0.1,
+            stereo_at: 0.2,
+            align_at: vec![0.1, 0.14, 0.18, 0.3, 0.4, 0.5, 0.6],
+            align_after: 250,
             grid_cells: 128.0,
             grid_rate: 0.05,
             sharpness: 0.3,
             skip_from: 0.1,
             explore: [0.5, 0.1],
+            precision: Precision::Auto,
             checkpoint_seconds: 60.0,
         }
     }

@@ -2,9 +2,18 @@
 
 use serde::{Deserialize, Serialize};
 
+use self::flatness::Bend;
 use crate::field::stream::StreamSamples;
 use crate::render::composite::{Interval, Weighted};
 use crate::render::forward::Chunk;
+
+pub mod flatness;
+
+/// Relative error of stereo depth that costs nothing.
+pub(super) const STEREO_ERROR: f32 = 0.01;
+
+/// Relative error of depth from which on a ray's end is simply elsewhere.
+pub(super) const FAR_OFF: f32 = 0.08;
 
 /// Weights of the loss's terms.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -20,6 +29,10 @@ pub struct LossConfig {
     pub distortion: f32,
     /// Softness Σ_k T_k α_k (1 − α_k) of a ray: surfaces are hard, air is empty.
     pub entropy: f32,
+    /// Price of stopping light where stereo says that a ray passes or that it has already ended.
+    pub depth: f32,
+    /// Price of a bend in depth where the picture is even.
+    pub flatness: f32,
     /// Price of per-frame exposure away from none: times half the squares of its six numbers.
     pub exposure: f32,
 }
@@ -32,6 +45,8 @@ impl Default for LossConfig {
             transient_opacity: [8.0, 6.0],
             distortion: 0.3,
             entropy: 0.0,
+            depth: 4.0,
+            flatness: 1.0,
             exposure: 0.1,
         }
     }
@@ -57,6 +72,8 @@ pub struct ChunkGradient {
     pub samples: [StreamSamples; 3],
     /// With respect to the six exposure numbers of each ray.
     pub exposure: Vec<[f32; 6]>,
+    /// With respect to the disparity of each ray.
+    disparity: Vec<f32>,
 }
 
 /// The colour that a ray should have, and how it was exposed.
@@ -68,13 +85,17 @@ pub struct RayTarget {
     pub background: [f32; 3],
     /// log gain and offset of the three channels.
     pub exposure: [f32; 6],
+    /// Distance along the ray at which it ends according to stereo, units; 0 where that is not known.
+    pub depth: f32,
 }
 
 /// Evaluates the loss of a traced chunk and fills `grad`. `scale` multiplies the whole gradient (1 / rays).
+#[inline(always)]
 pub fn backward(
     config: &LossConfig,
     chunk: &Chunk,
     targets: &[RayTarget],
+    bends: &[Bend],
     count: usize,
     scale: f32,
     grad: &mut ChunkGradient,
@@ -86,7 +107,8 @@ pub fn backward(
     for s in &mut grad.samples {
         s.reset(total);
     }
-    let mut loss = ChunkLoss::default();
+    let bent = flatness::backward(config.flatness, chunk, bends, count, scale, &mut grad.disparity);
+    let mut loss = ChunkLoss { total: f64::from(bent), ..ChunkLoss::default() };
     for (r, target) in targets.iter().enumerate() {
         let ray = &chunk.rays[r];
         let range = r * count..(r + 1) * count;
@@ -140,6 +162,23 @@ pub fn backward(
                     &mut grad.weight[range.clone()],
                 );
         }
+        if target.depth > 0.0 {
+            for k in range.clone() {
+                let price = config.depth * wrong_depth(chunk.intervals[k].t, target.depth);
+                extra += price * chunk.weighted[k].total();
+                for g in &mut grad.weight[k] {
+                    *g += scale * price;
+                }
+            }
+        }
+        if config.flatness > 0.0 {
+            let d = grad.disparity[r] / ray.ray.refined_cam.z;
+            for k in range.clone() {
+                for g in &mut grad.weight[k] {
+                    *g += d / chunk.intervals[k].t;
+                }
+            }
+        }
         if config.entropy > 0.0 {
             // Σ_k T α (1 − α) = Σ_k w (1 − α), w the weight of all streams: here its gradient by w.
             for (w, g) in chunk.weighted[range.clone()].iter().zip(&mut grad.weight[range.clone()]) {
@@ -178,7 +217,14 @@ pub fn backward(
     loss
 }
 
+/// How wrong it is for a ray to end at `t` where stereo says `depth`, 0 to 1: nothing within its error, and no more
+/// beyond [`FAR_OFF`], so that a false match costs a bounded price.
+fn wrong_depth(t: f32, depth: f32) -> f32 {
+    (((t - depth).abs() / depth - STEREO_ERROR) / (FAR_OFF - STEREO_ERROR)).clamp(0.0, 1.0)
+}
+
 /// Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i; adds its gradient with respect to the weights times `scale`, in O(n).
+#[inline(always)]
 fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &mut [[f32; 3]]) -> f32 {
     let (mut all, mut all_t) = (0.0, 0.0);
     for (i, w) in intervals.iter().zip(weighted) {

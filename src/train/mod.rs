@@ -1,6 +1,7 @@
 //! Losses, optimiser, schedule and checkpoints.
 
 pub mod adam;
+pub mod align;
 pub mod checkpoint;
 mod config;
 mod error;

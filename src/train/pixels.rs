@@ -1,9 +1,13 @@
 //! The training pixels, in memory.
 
+use glam::DAffine3;
 use rayon::prelude::*;
 
-use crate::render::rays::{PixelDirections, pixel_directions};
+use crate::field::Field;
+use crate::render::rays::{PixelDirections, View, pixel_directions};
+use crate::render::refined::refined_camera;
 use crate::scene::{Camera, Frame, SceneError};
+use crate::stereo::{self, StereoConfig, StereoDepth, StereoFrame};
 
 /// Frames with their pixels and the directions of their cameras' pixels.
 pub struct PixelSet {
@@ -11,6 +15,8 @@ pub struct PixelSet {
     pub frames: Vec<Frame>,
     /// sRGB, row-major, per frame.
     pub images: Vec<Vec<[u8; 3]>>,
+    /// Depth of the frames where their neighbours tell it; empty before it was looked for.
+    pub stereo: Vec<StereoDepth>,
     /// Indices of usable pixels where a frame has a mask.
     usable: Vec<Option<Vec<u32>>>,
     cameras: Vec<(Camera, PixelDirections)>,
@@ -43,12 +49,44 @@ impl PixelSet {
                 })
             })
             .collect();
-        Ok(Self { frames, images, usable, cameras, camera_of })
+        Ok(Self { frames, images, stereo: Vec::new(), usable, cameras, camera_of })
     }
 
     /// Directions of all pixels of frame `n` in camera axes.
     pub fn directions(&self, n: usize) -> &[glam::Vec3] {
         &self.cameras[self.camera_of[n]].1
+    }
+
+    /// Finds the depth of the frames by stereo, from where the field says that they are; in units.
+    pub fn look_at_depth(&mut self, field: &Field, config: &StereoConfig) {
+        let n = field.normalisation;
+        let cameras: Vec<(Camera, DAffine3)> = self
+            .frames
+            .iter()
+            .map(|f| {
+                let (camera, c2w) = refined_camera(field, f);
+                let translation = (c2w.translation - n.origin) / n.scale;
+                (camera, DAffine3 { translation, ..c2w })
+            })
+            .collect();
+        let frames: Vec<StereoFrame> = (cameras.iter().zip(&self.images))
+            .map(|((camera, c2w), rgb)| StereoFrame { camera, c2w: *c2w, rgb })
+            .collect();
+        self.stereo = stereo::depths(&frames, n.extent.length(), config);
+        for (depth, frame) in self.stereo.iter_mut().zip(&self.frames) {
+            // Asked by the directions that the scene's own intrinsics give.
+            depth.refine(View::new(field, frame).lens);
+        }
+        let coverage = self.stereo.iter().map(StereoDepth::coverage).sum::<f64>();
+        tracing::info!(coverage = coverage / self.frames.len().max(1) as f64, "depth by stereo");
+    }
+
+    /// Distance along the ray of a pixel of frame `n` at which it ends according to stereo, in the unit of the
+    /// depths there; 0 where that is not known.
+    pub fn stereo_distance(&self, n: usize, pixel: usize) -> f32 {
+        let Some(stereo) = self.stereo.get(n) else { return 0.0 };
+        let dir = self.directions(n)[pixel];
+        stereo.at(dir).map_or(0.0, |z| z / dir.z)
     }
 
     /// Mean colour of all images, sRGB 0–1.

@@ -38,6 +38,7 @@ impl TrainConfig {
             pose_rate: self.pose_rate * refine,
             rig_rate: self.rig_rate * refine,
             streams,
+            precision: self.precision,
         }
     }
 

@@ -4,6 +4,7 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use super::align;
 use super::checkpoint::{Trained, TrainingState};
 use super::config::StreamChoice;
 use super::error::TrainError;
@@ -13,6 +14,7 @@ use crate::config::Config;
 use crate::field::{Field, FieldShape, Normalisation};
 use crate::render::forward::{Grids, Model};
 use crate::render::image::render;
+use crate::render::sampler::Sampling;
 use crate::scene::{Frame, Scene, Split};
 
 #[cfg(test)]
@@ -147,6 +149,17 @@ impl Trainer {
             if !self.trained.progress.streams_settled && fraction >= self.config.train.static_until {
                 self.settle_streams();
             }
+            let stereo_at = self.config.train.stereo_at;
+            if self.pixels.stereo.is_empty() && fraction >= stereo_at && stereo_at < 1.0 {
+                self.look_at_depth();
+            }
+            let due = self.config.train.align_at.iter().filter(|at| fraction >= **at).count();
+            if due > self.trained.progress.aligned
+                && self.trained.progress.step >= self.config.train.align_after
+            {
+                self.align();
+                self.trained.progress.aligned = due;
+            }
             if fraction >= self.config.train.skip_from {
                 self.trained.grids.skip_below(OCCUPIED_ALPHA);
             }
@@ -219,6 +232,28 @@ impl Trainer {
             Some(index) => Err(non_finite("a network weight", index)),
             None => Ok(report),
         }
+    }
+
+    /// Registers all training frames to what the field shows from where they are.
+    fn align(&mut self) {
+        let model = Model::new(&self.trained.field, &self.trained.grids, self.streams);
+        let sampling = Sampling { count: self.config.train.samples, ..self.config.train.render_sampling() };
+        let correction = align::align(&model, &self.pixels, &sampling);
+        correction.apply(&mut self.trained.field);
+        let a = correction.report;
+        tracing::info!(a.frames, a.rotation, a.translation, lens = ?a.lens, "frames aligned");
+    }
+
+    /// Finds the depth of the training frames by stereo: from where they are by now, or from where they were when a
+    /// training that goes on did so.
+    fn look_at_depth(&mut self) {
+        let Trained { field, progress, .. } = &mut self.trained;
+        let refinement = field.layout.pose.start..field.layout.rig.end;
+        let now = field.weights[refinement.clone()].to_vec();
+        let then = progress.stereo_from.get_or_insert_with(|| now.clone());
+        field.weights[refinement.clone()].copy_from_slice(then);
+        self.pixels.look_at_depth(field, &self.config.stereo);
+        field.weights[refinement].copy_from_slice(&now);
     }
 
     /// Decides which streams the scene needs, once the persistent one has had its time alone.

@@ -8,9 +8,10 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::error::CompressError;
-use crate::field::mlp::{Mlp, Packed, TileView};
+use crate::field::mlp::{Activations, Mlp, Packed, Precision};
 use crate::rng::Rng;
-use crate::simd::{AlignedVec, TILE};
+use crate::simd::TILE;
+use crate::simd::matrix::Unit;
 use crate::train::adam::{self, Moments, StepSize};
 
 /// Tiles of a training step, each with its own gradient: sums are taken in the same order on any machine.
@@ -139,7 +140,7 @@ impl Autoencoder {
 
     /// Codes of `rows` `[n, full]`, to `out` `[n, dim]`.
     pub fn encode(&self, rows: &[f32], out: &mut [f32]) {
-        let packed = self.pack()[0].clone();
+        let [packed, _] = self.pack();
         let nets = Half { net: &self.encoder, packed: &packed, from: self.full, to: self.dim };
         let mut centred = rows.to_vec();
         for row in centred.chunks_exact_mut(self.full) {
@@ -150,7 +151,7 @@ impl Autoencoder {
 
     /// Descriptors of `codes` `[n, dim]`, to `out` `[n, full]`. Not normalised.
     pub fn decode(&self, codes: &[f32], out: &mut [f32]) {
-        let packed = self.pack()[1].clone();
+        let [_, packed] = self.pack();
         let nets = Half { net: &self.decoder, packed: &packed, from: self.dim, to: self.full };
         Arch::new().dispatch(RunHalf { half: nets, rows: codes, out });
     }
@@ -163,7 +164,8 @@ impl Autoencoder {
 
     fn pack(&self) -> [Packed; 2] {
         let (encoder, decoder) = self.weights.split_at(self.encoder.parameters());
-        [self.encoder.pack(encoder), self.decoder.pack(decoder)]
+        // The whole point is a small error: bf16 would add its own.
+        [self.encoder.pack(encoder, Precision::F32), self.decoder.pack(decoder, Precision::F32)]
     }
 }
 
@@ -192,18 +194,20 @@ impl WithSimd for RunHalf<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Half { net, packed, from, to } = self.half;
-        let mut tile = AlignedVec::zeros(net.rows() * TILE);
+        let (unit, mut tile) = (Unit::detect(), Activations::default());
+        net.reserve(packed, 1, &mut tile);
         for (rows, out) in self.rows.chunks(TILE * from).zip(self.out.chunks_mut(TILE * to)) {
-            tile[..net.input() * TILE].fill(0.0);
+            let input = tile.input(0);
+            input.fill(0.0);
             for (lane, row) in rows.chunks_exact(from).enumerate() {
                 for (i, v) in row.iter().enumerate() {
-                    tile[i * TILE + lane] = *v;
+                    input[i * TILE + lane] = *v;
                 }
             }
-            net.forward(simd, packed, &mut tile);
+            net.forward(simd, &unit, packed, &mut tile, 0);
             for (lane, out) in out.chunks_exact_mut(to).enumerate() {
                 for (i, v) in out.iter_mut().enumerate() {
-                    *v = tile[(net.output_row() + i) * TILE + lane];
+                    *v = tile.output(0)[i * TILE + lane];
                 }
             }
         }
@@ -225,28 +229,31 @@ impl WithSimd for TrainTile<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let (encoder, decoder, full) = (&self.of.encoder, &self.of.decoder, self.of.full);
-        // The code is the encoder's last layer and the decoder's input: their rows overlap there.
-        let code = encoder.output_row();
-        let rows = code + decoder.rows();
-        let mut tile = AlignedVec::zeros(rows * TILE);
-        let mut grad = AlignedVec::zeros(rows * TILE);
+        let (unit, [pack_encoder, pack_decoder]) = (Unit::detect(), self.packed);
+        let (mut code, mut back) = (Activations::default(), Activations::default());
+        encoder.reserve(pack_encoder, 1, &mut code);
+        decoder.reserve(pack_decoder, 1, &mut back);
+        let input = code.input(0);
+        input.fill(0.0);
         for (lane, n) in self.picked.iter().enumerate() {
             for i in 0..full {
-                tile[i * TILE + lane] = self.rows[n * full + i] - self.of.mean[i];
+                input[i * TILE + lane] = self.rows[n * full + i] - self.of.mean[i];
             }
         }
-        encoder.forward(simd, &self.packed[0], &mut tile[..encoder.rows() * TILE]);
-        decoder.forward(simd, &self.packed[1], &mut tile[code * TILE..]);
-        let output = (code + decoder.output_row()) * TILE;
-        loss_gradient(self.rows, &self.picked, full, &tile[output..], &mut grad[output..]);
-        decoder.backward(simd, &self.packed[1], &tile[code * TILE..], &mut grad[code * TILE..], true);
-        let end = encoder.rows() * TILE;
-        encoder.backward(simd, &self.packed[0], &tile[..end], &mut grad[..end], false);
+        encoder.forward(simd, &unit, pack_encoder, &mut code, 0);
+        back.input(0).copy_from_slice(code.output(0));
+        decoder.forward(simd, &unit, pack_decoder, &mut back, 0);
+        let output = back.output(0).to_vec();
+        let grad = back.output_grad(0);
+        grad.fill(0.0);
+        loss_gradient(self.rows, &self.picked, full, &output, grad);
+        decoder.backward(simd, &unit, pack_decoder, &mut back, 0);
+        code.output_grad(0).copy_from_slice(back.input_grad(0));
+        encoder.backward(simd, &unit, pack_encoder, &mut code, 0);
         self.gradient.fill(0.0);
         let (of_encoder, of_decoder) = self.gradient.split_at_mut(encoder.parameters());
-        let view = |data, row: usize| TileView { data, stride: rows * TILE, offset: row * TILE };
-        encoder.accumulate(simd, view(&tile, 0), view(&grad, 0), 1, of_encoder);
-        decoder.accumulate(simd, view(&tile, code), view(&grad, code), 1, of_decoder);
+        encoder.accumulate(simd, &unit, pack_encoder, &mut code, 1, of_encoder);
+        decoder.accumulate(simd, &unit, pack_decoder, &mut back, 1, of_decoder);
     }
 }
 

@@ -63,7 +63,7 @@ fn the_dimension_is_the_smallest_that_is_good_enough() {
     let rows = clustered(300, 12, 3);
     let made = fit(&rows, &CompressConfig { feature_error: 0.02, ..CompressConfig::default() });
     assert!(
-        made.error <= 0.02 && made.dim() % 4 == 0 && made.dim() < FULL,
+        made.error <= 0.02 && made.dim().is_multiple_of(4) && made.dim() < FULL,
         "{} at {}",
         made.error,
         made.dim()

@@ -131,6 +131,9 @@ pub struct Relevancy {
     pub coverage: Vec<f32>,
 }
 
+/// First point, and where its chunk's scores (one list per phrase) and coverage go.
+type Task<'a> = (usize, Vec<&'a mut [f32]>, &'a mut [f32]);
+
 impl Queries {
     /// Phrases for features that are as long as the embeddings.
     ///
@@ -203,7 +206,7 @@ impl Queries {
         let mut scores = vec![vec![0.0; count]; self.wanted];
         let mut coverage = vec![0.0; count];
         let packed = kernel::Packed::new(self);
-        let mut tasks: Vec<(usize, Vec<&mut [f32]>, &mut [f32])> = coverage
+        let mut tasks: Vec<Task> = coverage
             .chunks_mut(CHUNK)
             .enumerate()
             .map(|(n, coverage)| (n * CHUNK, Vec::with_capacity(self.wanted), coverage))

@@ -29,6 +29,8 @@ fn random(seed: u64) -> (Trained, Optimiser) {
         rays: 5,
         streams_settled: true,
         unexplained: Some(0.125),
+        aligned: 2,
+        stereo_from: Some(vec![1.5e-3, -0.1, 0.0]),
     };
     let mut trained = Trained { field, grids, progress };
     trained.visit_mut(&mut fill).expect("filling cannot fail");

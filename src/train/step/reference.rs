@@ -7,13 +7,14 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::field::codes::Trajectory;
-use crate::field::hashgrid::{FEATURES, Level};
+use crate::field::hashgrid::{AXES, FEATURES, Level};
 use crate::field::mlp::Mlp;
 use crate::field::stream::BETA_MAX;
 use crate::field::{Field, VIEW};
 use crate::render::forward::{Chunk, RayInput};
 use crate::render::rays::View;
-use crate::train::loss::{LossConfig, RayTarget};
+use crate::train::loss::flatness::{self, Bend};
+use crate::train::loss::{FAR_OFF, LossConfig, RayTarget, STEREO_ERROR};
 
 /// Everything that is learned, in f64.
 #[derive(Clone)]
@@ -43,6 +44,7 @@ pub struct Reference<'a> {
     pub chunk: &'a Chunk,
     pub inputs: &'a [RayInput],
     pub targets: &'a [RayTarget],
+    pub bends: &'a [Bend],
     pub config: &'a LossConfig,
     pub count: usize,
 }
@@ -64,11 +66,27 @@ impl Reference<'_> {
             }
         }
         let rays = self.inputs.len();
-        let sum: f64 = (0..rays).map(|r| self.ray_loss(r, &samples[r * self.count..][..self.count], x)).sum();
-        sum / rays as f64
+        let mut sum = 0.0;
+        let mut disparity = vec![0.0; rays];
+        for r in 0..rays {
+            sum += self.ray_loss(r, &samples[r * self.count..][..self.count], x, &mut disparity[r]);
+        }
+        (sum + self.bend_loss(&disparity)) / rays as f64
     }
 
-    fn ray_loss(&self, r: usize, samples: &[[Sample; 3]], x: &Numbers) -> f64 {
+    fn bend_loss(&self, disparity: &[f64]) -> f64 {
+        let constant = |r: usize| flatness::disparity(self.chunk, r, self.count);
+        let price = |bend: &Bend| {
+            let [a, b, c] = bend.rays.map(|r| disparity[r]);
+            let level = flatness::level(bend.rays.map(constant));
+            let [small, large] = [flatness::SMALL, flatness::LARGE].map(f64::from);
+            let size = ((a - 2.0 * b + c) / f64::from(level)).hypot(small);
+            f64::from(bend.weight) * (size - small) / (size + large)
+        };
+        f64::from(self.config.flatness) * self.bends.iter().map(price).sum::<f64>()
+    }
+
+    fn ray_loss(&self, r: usize, samples: &[[Sample; 3]], x: &Numbers, disparity: &mut f64) -> f64 {
         let intervals = &self.chunk.intervals[r * self.count..][..self.count];
         let c = self.config;
         let mut light = 1.0;
@@ -92,6 +110,13 @@ impl Reference<'_> {
                     price += f64::from(c.transient_opacity[s - 1]) * w;
                 }
             }
+            let (t, depth) = (f64::from(i.t), f64::from(self.targets[r].depth));
+            if depth > 0.0 {
+                let [free, whole] = [STEREO_ERROR, FAR_OFF].map(f64::from);
+                let wrong = (((t - depth).abs() / depth - free) / (whole - free)).clamp(0.0, 1.0);
+                price += f64::from(c.depth) * wrong * total;
+            }
+            *disparity += total / (t * f64::from(self.chunk.rays[r].ray.refined_cam.z));
             entropy += light * alpha * (1.0 - alpha);
             weights.push((total, f64::from(i.t), delta));
             light *= 1.0 - alpha;
@@ -126,6 +151,8 @@ impl Reference<'_> {
         let p = self.position(s, k, x);
         let mut input = Vec::new();
         let extent = if s == 2 { DVec3::ONE } else { field.normalisation.extent.as_dvec3() };
+        let time = f64::from(self.views[self.inputs[r].view as usize].time);
+        let (p, extent) = ([p.x, p.y, p.z, time], [extent.x, extent.y, extent.z, 1.0]);
         for (level, table) in net.grid.levels.iter().zip(&x.tables[s]) {
             input.extend(interpolate(level, table, p, extent));
         }
@@ -164,7 +191,8 @@ impl Reference<'_> {
         for (p, shared) in pose.iter_mut().zip(rig) {
             *p += shared;
         }
-        let zoomed = DVec3::new(dir.x * (1.0 + rig[6]), dir.y * (1.0 + rig[6]), dir.z);
+        let zoom = 1.0 + rig[6] + rig[7] * (dir.x * dir.x + dir.y * dir.y) / (dir.z * dir.z);
+        let zoomed = DVec3::new(dir.x * zoom, dir.y * zoom, dir.z);
         let turn = DVec3::new(pose[0], pose[1], pose[2]).cross(dir);
         let axes: DMat3 = view.rotation.as_dmat3();
         view.centre.as_dvec3() + axes * DVec3::new(pose[3], pose[4], pose[5]) + axes * (zoomed + turn) * t
@@ -190,14 +218,15 @@ impl Reference<'_> {
 }
 
 /// Trilinear interpolation of one level's rows.
-fn interpolate(level: &Level, table: &[f64], p: DVec3, extent: DVec3) -> [f64; FEATURES] {
+fn interpolate(level: &Level, table: &[f64], p: [f64; AXES], extent: [f64; AXES]) -> [f64; FEATURES] {
     let mut cell = [0u64; 3];
     let mut frac = [0.0; 3];
     let mut points = [0u64; 3];
     for axis in 0..3 {
+        let along = level.axes[axis];
         // The lattice is laid out in f32.
-        let cells = (extent[axis] as f32 * level.scale[axis]).ceil().max(1.0) as u64;
-        let q = p[axis] * f64::from(level.scale[axis]);
+        let cells = (extent[along] as f32 * level.scale[axis]).ceil().max(1.0) as u64;
+        let q = p[along] * f64::from(level.scale[axis]);
         cell[axis] = (q.floor().max(0.0) as u64).min(cells - 1);
         frac[axis] = (q - cell[axis] as f64).clamp(0.0, 1.0);
         points[axis] = cells + 1;

@@ -13,6 +13,10 @@ fn config(static_until: f64) -> Config {
     config.train.steps = STEPS;
     config.train.streams = StreamChoice::All;
     config.train.static_until = static_until;
+    // Frames are aligned and their depth is looked for, before and after the interruption of the tests below.
+    config.train.stereo_at = 0.1;
+    config.train.align_at = vec![0.3, 0.8];
+    config.train.align_after = 0;
     config
 }
 

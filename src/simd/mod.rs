@@ -1,8 +1,12 @@
 //! What the vector kernels share: aligned storage, the tile width, and transcendental functions that vectorise.
 //!
 //! Kernels are written once over [`pulp::Simd`]; `pulp` picks AVX-512, AVX2, NEON or plain scalar code at run time, so
-//! this crate needs no `unsafe`. Lanes are always samples, never features: every width gives the same forward result
+//! they need no `unsafe`. Lanes are always samples, never features: every width gives the same forward result
 //! for every sample.
+
+#[cfg(target_arch = "x86_64")]
+mod amx;
+pub mod matrix;
 
 use bytemuck::{Pod, Zeroable};
 
@@ -74,6 +78,19 @@ pub fn exp(x: f32) -> f32 {
     p * f32::from_bits(exponent)
 }
 
+/// The whole number below x, at most `last` (< 2^23) and at least 0, as integer and float; 0 for NaN.
+///
+/// `as u32` saturates lane by lane; adding 2^23 leaves the number in the low mantissa bits and vectorises.
+#[inline(always)]
+pub fn floor_within(x: f32, last: f32) -> (u32, f32) {
+    const SHIFT: f32 = 8_388_608.0;
+    let n = x.floor();
+    // In this order NaN becomes 0.
+    let n = if n > 0.0 { n } else { 0.0 };
+    let n = if n < last { n } else { last };
+    ((n + SHIFT).to_bits() & 0x007f_ffff, n)
+}
+
 /// 1 / (1 + e^-x).
 #[inline(always)]
 pub fn sigmoid(x: f32) -> f32 {
@@ -101,6 +118,16 @@ mod tests {
             let err = (f64::from(exp(x)) - truth).abs() / truth;
             assert!(err < 2.5e-7, "exp({x}) is off by {err:e}");
         }
+    }
+
+    #[test]
+    fn floors_stay_within_their_range() {
+        let cases =
+            [(0.0, 0), (0.99, 0), (1.0, 1), (6.999, 6), (7.0, 7), (8.5, 7), (-0.1, 0), (1e30, 7), (-1e30, 0)];
+        for (x, n) in cases.into_iter().chain([(f32::NAN, 0), (f32::INFINITY, 7), (f32::NEG_INFINITY, 0)]) {
+            assert_eq!(floor_within(x, 7.0), (n, n as f32), "{x}");
+        }
+        assert_eq!(floor_within(8_388_606.0, 8_388_607.0).0, 8_388_606);
     }
 
     #[test]

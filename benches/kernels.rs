@@ -1,0 +1,286 @@
+//! The kernels of a training step, each beside the least time that the machine allows for it.
+//!
+//! `cargo bench --bench kernels`. The floors come from what the machine can do at most, measured on a Xeon of the
+//! Sapphire Rapids family; another machine's figures are given by the environment:
+//! `DIVFF_F32_GFLOPS`, `DIVFF_BF16_GFLOPS`, `DIVFF_MROWS` (random 16-byte reads of a 2 MiB table a second, in millions),
+//! `DIVFF_GBPS` (read and written).
+
+use std::hint::black_box;
+
+use criterion::{Criterion, Throughput, criterion_main};
+use divff::field::hashgrid::{AXES, HashGrid, Level, Points, Row};
+use divff::field::mlp::{Activations, Mlp, Packed, Precision};
+use divff::render::composite::{self, Interval, Weighted};
+use divff::render::density_grid::{DensityGrid, STRIDE};
+use divff::render::rays::Ray;
+use divff::render::sampler::{Sampler, Sampling, Steer};
+use divff::simd::TILE;
+use divff::simd::matrix::Unit;
+use divff::train::adam::{StepSize, TableState};
+use glam::Vec3;
+use pulp::{Simd, WithSimd};
+
+/// Tiles of a chunk of 32 rays.
+const TILES: usize = 13;
+
+/// Samples of the table kernels: as many reads of a table as a step of 4096 rays makes.
+const POINTS: usize = 20 * 4096;
+
+fn rate(name: &str, default: f64) -> f64 {
+    std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(default)
+}
+
+/// Prints the least time for `work` at `per_second`.
+fn floor(kernel: &str, work: f64, per_second: f64) {
+    println!("{kernel}: floor {:.2} µs", 1e6 * work / per_second);
+}
+
+/// Numbers in [0, 1), the same in every run.
+struct Numbers(u64);
+
+impl Numbers {
+    fn next(&mut self) -> f32 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 40) as f32 / (1u64 << 24) as f32
+    }
+}
+
+/// One of the passes over a chunk's tiles.
+#[derive(Clone, Copy)]
+enum Pass {
+    Forward,
+    Backward,
+    WeightGradients,
+}
+
+struct NetworkPass<'a> {
+    pass: Pass,
+    net: &'a Mlp,
+    packed: &'a Packed,
+    activations: &'a mut Activations,
+    gradient: &'a mut [f32],
+}
+
+impl WithSimd for NetworkPass<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { pass, net, packed, activations, gradient } = self;
+        let unit = Unit::detect();
+        match pass {
+            // Loops and not closures, which would be compiled without the vector features.
+            Pass::Forward => {
+                for n in 0..TILES {
+                    net.forward(simd, &unit, packed, activations, n);
+                }
+            }
+            Pass::Backward => {
+                for n in 0..TILES {
+                    net.backward(simd, &unit, packed, activations, n);
+                }
+            }
+            Pass::WeightGradients => net.accumulate(simd, &unit, packed, activations, TILES, gradient),
+        }
+    }
+}
+
+fn networks(c: &mut Criterion) {
+    let mut numbers = Numbers(1);
+    let net = Mlp::new(&[40, 64, 64, 16]);
+    let params = net.init(|| numbers.next());
+    let flops = 2.0 * (net.multiply_adds() * TILES * TILE) as f64;
+    for (precision, peak) in [
+        (Precision::F32, rate("DIVFF_F32_GFLOPS", 140.0)),
+        (Precision::Bf16, rate("DIVFF_BF16_GFLOPS", 2600.0)),
+    ] {
+        let packed = net.pack(&params, precision);
+        let mut activations = Activations::default();
+        net.reserve(&packed, TILES, &mut activations);
+        for n in 0..TILES {
+            activations.input(n).fill_with(|| numbers.next());
+            activations.output_grad(n).fill_with(|| numbers.next());
+        }
+        let mut gradient = vec![0.0; net.parameters()];
+        let passes =
+            [("forward", Pass::Forward), ("backward", Pass::Backward), ("weights", Pass::WeightGradients)];
+        for (name, pass) in passes {
+            let name = format!("network {precision:?} {name}");
+            floor(&name, flops, 1e9 * peak);
+            let mut group = c.benchmark_group("network");
+            group.throughput(Throughput::Elements((TILES * TILE) as u64));
+            group.bench_function(name, |b| {
+                b.iter(|| {
+                    pulp::Arch::new().dispatch(NetworkPass {
+                        pass,
+                        net: &net,
+                        packed: &packed,
+                        activations: &mut activations,
+                        gradient: &mut gradient,
+                    });
+                });
+            });
+        }
+    }
+}
+
+/// What is done with a level's table.
+enum Table<'a> {
+    Encode(&'a [Row], &'a mut [Row]),
+    Scatter(&'a mut [Row], &'a [Row]),
+    Update(&'a mut TableState, &'a mut [Row]),
+}
+
+struct TablePass<'a>(&'a Level, &'a [Points], Table<'a>);
+
+impl WithSimd for TablePass<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let Self(level, points, table) = self;
+        match table {
+            Table::Encode(table, out) => {
+                for (p, out) in points.iter().zip(out.chunks_mut(TILE)) {
+                    level.encode(table, p, out);
+                }
+            }
+            Table::Scatter(table, g) => {
+                for (p, g) in points.iter().zip(g.chunks(TILE)) {
+                    level.scatter(table, p, g);
+                }
+            }
+            Table::Update(state, table) => state.update(table, StepSize::new(1e-3, 10)),
+        }
+    }
+}
+
+fn tables(c: &mut Criterion) {
+    let mut numbers = Numbers(2);
+    let grid = HashGrid::new(Vec3::ONE, 1, Vec3::splat(256.0), Vec3::splat(256.0), 17);
+    let level = &grid.levels[0];
+    // Patches of 16 neighbours, as the rays of a step are.
+    let mut at = Vec3::ZERO;
+    let mut points = vec![[[0.0; TILE]; AXES]; POINTS.div_ceil(TILE)];
+    for (n, tile) in points.iter_mut().enumerate() {
+        for lane in 0..TILE {
+            if (n * TILE + lane).is_multiple_of(16) {
+                at = Vec3::new(numbers.next(), numbers.next(), numbers.next());
+            }
+            for axis in 0..3 {
+                tile[axis][lane] = at[axis] + 0.01 * numbers.next();
+            }
+        }
+    }
+    let mut table = vec![Row::splat(0.1); level.rows];
+    let mut state = TableState::new(level.rows);
+    let mut rows = vec![Row::ONE; points.len() * TILE];
+    let lookups = 8.0 * (points.len() * TILE) as f64;
+    let per_second = 1e6 * rate("DIVFF_MROWS", 600.0);
+    let mut group = c.benchmark_group("table");
+    group.throughput(Throughput::Elements(POINTS as u64));
+    group.sample_size(30);
+    floor("encode", lookups, per_second);
+    group.bench_function("encode", |b| {
+        b.iter(|| {
+            pulp::Arch::new().dispatch(TablePass(level, &points, Table::Encode(&table, &mut rows)));
+        });
+    });
+    floor("scatter", lookups, per_second);
+    group.bench_function("scatter", |b| {
+        b.iter(|| {
+            pulp::Arch::new().dispatch(TablePass(level, &points, Table::Scatter(&mut state.grad, &rows)));
+        });
+    });
+    // Four tables read and written.
+    floor("adam", 8.0 * 16.0 * level.rows as f64, 1e9 * rate("DIVFF_GBPS", 17.0));
+    group.bench_function("adam", |b| {
+        b.iter(|| {
+            state.grad.fill(Row::ONE);
+            pulp::Arch::new().dispatch(TablePass(level, &[], Table::Update(&mut state, &mut table)));
+        });
+    });
+}
+
+/// A wall in a density grid.
+struct Wall(DensityGrid);
+
+impl Steer for Wall {
+    #[inline(always)]
+    fn sigma(&self, points: &[[f32; STRIDE]; 3], _: &[f32; STRIDE]) -> [f32; STRIDE] {
+        let mut out = [0.0; STRIDE];
+        self.0.add_at(points, 0, &mut out);
+        out
+    }
+}
+
+const SAMPLING: Sampling = Sampling { count: 20, step: 1.0 / 128.0, explore: 0.1, sharpness: 0.3 };
+
+struct SamplerPass<'a>(&'a mut Sampler, &'a Wall, &'a [Ray], &'a mut [f32]);
+
+impl WithSimd for SamplerPass<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let Self(sampler, wall, rays, edges) = self;
+        for ray in rays {
+            black_box(sampler.edges(ray, &SAMPLING, 0.5, wall, edges));
+        }
+    }
+}
+
+struct CompositePass<'a>(&'a [Interval], &'a mut [Weighted], &'a mut [[f32; 3]]);
+
+impl WithSimd for CompositePass<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let Self(intervals, weighted, d_sigma) = self;
+        let n = SAMPLING.count;
+        for ((i, w), d) in intervals.chunks(n).zip(weighted.chunks_mut(n)).zip(d_sigma.chunks_mut(n)) {
+            let left = composite::weights(i, w);
+            composite::backward(i, w, left, &[[0.1; 3]; SAMPLING.count], 0.1, d);
+        }
+    }
+}
+
+fn rays(c: &mut Criterion) {
+    let mut numbers = Numbers(3);
+    let mut wall = Wall(DensityGrid::new(Vec3::ONE, Vec3::splat(1.0 / 128.0), 1, 0.1));
+    let cells = wall.0.sigma.len();
+    wall.0.sigma[cells * 3 / 4..].fill(500.0);
+    let rays: Vec<Ray> = (0..32)
+        .map(|_| {
+            let origin = Vec3::new(0.5 * numbers.next(), 0.5 * numbers.next(), 0.0);
+            let dir = Vec3::new(0.3 * numbers.next(), 0.3 * numbers.next(), 1.0);
+            Ray { origin, dir, dir_cam: Vec3::Z, refined_cam: Vec3::Z, range: (0.01, 0.99) }
+        })
+        .collect();
+    let mut edges = vec![0.0; SAMPLING.count + 1];
+    let mut sampler = Sampler::default();
+    let mut group = c.benchmark_group("rays");
+    group.throughput(Throughput::Elements((rays.len() * SAMPLING.count) as u64));
+    // A quarter of the way is behind the wall; neighbouring steps share cache lines, so that a step is one load.
+    floor("sampler", 32.0 * 0.75 * 128.0, 1e6 * rate("DIVFF_MROWS", 600.0));
+    group.bench_function("sampler", |b| {
+        b.iter(|| pulp::Arch::new().dispatch(SamplerPass(&mut sampler, &wall, &rays, &mut edges)));
+    });
+    let interval = |k: usize| Interval { sigma: [k as f32, 0.1, 0.2], delta: 0.02, t: 0.02 * k as f32 };
+    let intervals: Vec<Interval> = (0..32 * SAMPLING.count).map(|k| interval(k % SAMPLING.count)).collect();
+    let mut weighted = vec![Weighted::default(); intervals.len()];
+    let mut d_sigma = vec![[0.0; 3]; intervals.len()];
+    // Two exponentials of some twenty operations, and as many again to mix three streams forward and backward.
+    floor("composite", 80.0 * intervals.len() as f64, 1e9 * rate("DIVFF_F32_GFLOPS", 140.0));
+    group.bench_function("composite", |b| {
+        b.iter(|| pulp::Arch::new().dispatch(CompositePass(&intervals, &mut weighted, &mut d_sigma)));
+    });
+}
+
+#[allow(missing_docs)]
+mod groups {
+    criterion::criterion_group!(benches, super::networks, super::tables, super::rays);
+}
+criterion_main!(groups::benches);
+//(benches, networks, tables, rays);

@@ -1,0 +1,251 @@
+//! Small fully connected networks on tiles of samples, forward and backward.
+//!
+//! A tile's inputs, outputs and their gradients are f32, feature-major `[features][TILE]`. What lies between is the
+//! business of the arithmetic: `vector` computes in f32, `matrix` multiplies in bf16 and sums in f32. Both keep a
+//! chunk's activations together, so that the weight gradients are one product over all its samples.
+
+mod matrix;
+mod vector;
+
+use pulp::Simd;
+use serde::{Deserialize, Serialize};
+
+use self::vector::TileView;
+use crate::simd::matrix::{Unit, available};
+use crate::simd::{AlignedVec, TILE};
+
+/// Widths are multiples of this.
+const BLOCK: usize = 4;
+
+/// What the networks are multiplied in. Weights, sums, gradients and everything else are f32 in any case.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// bf16 on CPUs with matrix units (Intel AMX), else f32.
+    #[default]
+    Auto,
+    /// f32.
+    F32,
+    /// bf16; slow on CPUs without matrix units.
+    Bf16,
+}
+
+impl Precision {
+    fn is_bf16(self) -> bool {
+        self == Self::Bf16 || self == Self::Auto && available()
+    }
+}
+
+/// The shape of a network with ReLU between its layers and none after the last.
+///
+/// Parameters are one flat slice: for each layer the weights `[out][in]`, then the biases `[out]`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mlp {
+    /// Widths: input, hidden ..., output. All multiples of 4.
+    widths: Vec<usize>,
+    layers: Vec<Layer>,
+}
+
+impl Mlp {
+    /// A network of the given widths (input, hidden ..., output), each rounded up to a multiple of 4.
+    pub fn new(widths: &[usize]) -> Self {
+        assert!(widths.len() >= 2, "a network has an input and an output");
+        let widths: Vec<usize> = widths.iter().map(|w| w.next_multiple_of(BLOCK)).collect();
+        let mut at = Layer::default();
+        let layers = widths.windows(2).map(|w| {
+            let layer = Layer { n_in: w[0], n_out: w[1], ..at };
+            at.row += w[0];
+            at.param += layer.weights() + w[1];
+            at.weight += layer.weights();
+            at.bias += w[1];
+            layer
+        });
+        Self { layers: layers.collect(), widths }
+    }
+
+    /// Widths of input, hidden layers and output, as rounded up.
+    pub fn widths(&self) -> &[usize] {
+        &self.widths
+    }
+
+    /// Width of the input, as rounded up.
+    pub fn input(&self) -> usize {
+        self.widths[0]
+    }
+
+    /// Width of the output, as rounded up.
+    pub fn output(&self) -> usize {
+        self.widths[self.widths.len() - 1]
+    }
+
+    /// Rows of one tile: input and every layer's output.
+    pub fn rows(&self) -> usize {
+        self.widths.iter().sum()
+    }
+
+    /// First row of the output within a tile.
+    pub fn output_row(&self) -> usize {
+        self.rows() - self.output()
+    }
+
+    /// Number of parameters.
+    pub fn parameters(&self) -> usize {
+        self.layers.iter().map(|l| l.weights() + l.n_out).sum()
+    }
+
+    /// Multiply-adds of one sample's forward pass.
+    pub fn multiply_adds(&self) -> usize {
+        self.layers.iter().map(|l| l.weights()).sum()
+    }
+
+    /// Kaiming-uniform weights and zero biases, from a stream of uniform numbers in [0, 1).
+    pub fn init(&self, mut uniform: impl FnMut() -> f32) -> Vec<f32> {
+        let mut params = Vec::with_capacity(self.parameters());
+        for layer in &self.layers {
+            let bound = (6.0 / layer.n_in as f32).sqrt();
+            params.extend((0..layer.weights()).map(|_| (2.0 * uniform() - 1.0) * bound));
+            params.extend(std::iter::repeat_n(0.0, layer.n_out));
+        }
+        params
+    }
+
+    /// The weights as the kernels read them; made once per step.
+    pub fn pack(&self, params: &[f32], precision: Precision) -> Packed {
+        match precision.is_bf16() {
+            true => Packed::Matrix(matrix::Packed::new(&self.layers, params)),
+            false => Packed::Vector(vector::Packed::new(&self.layers, params)),
+        }
+    }
+
+    /// Makes room for the activations of `tiles` tiles.
+    pub fn reserve(&self, packed: &Packed, tiles: usize, a: &mut Activations) {
+        (a.input, a.output) = (self.input() * TILE, self.output() * TILE);
+        let floats = match packed {
+            Packed::Vector(_) => {
+                a.stride = self.rows() * TILE;
+                a.stride * tiles
+            }
+            Packed::Matrix(packed) => {
+                a.stride = 0;
+                packed.reserve(&self.layers, tiles, &mut a.saved);
+                a.input + a.output
+            }
+        };
+        a.end = if a.stride > 0 { a.stride } else { floats };
+        a.values.reserve_len(floats);
+        a.grads.reserve_len(floats);
+    }
+
+    /// From the input rows of tile `n` to its output rows.
+    #[inline(always)]
+    pub fn forward<S: Simd>(&self, simd: S, unit: &Unit, packed: &Packed, a: &mut Activations, n: usize) {
+        let tile = &mut a.values[n * a.stride..][..a.end];
+        match packed {
+            Packed::Vector(packed) => packed.forward(simd, &self.layers, tile),
+            Packed::Matrix(packed) => packed.forward(unit, &self.layers, tile, &mut a.saved, n),
+        }
+    }
+
+    /// From the gradient of the output rows of tile `n` to that of its input rows.
+    #[inline(always)]
+    pub fn backward<S: Simd>(&self, simd: S, unit: &Unit, packed: &Packed, a: &mut Activations, n: usize) {
+        let grad = &mut a.grads[n * a.stride..][..a.end];
+        match packed {
+            Packed::Vector(packed) => {
+                packed.backward(simd, &self.layers, &a.values[n * a.stride..][..a.end], grad);
+            }
+            Packed::Matrix(packed) => packed.backward(unit, &self.layers, grad, &mut a.saved, n),
+        }
+    }
+
+    /// Adds the parameter gradients of the first `tiles` tiles to `out` (same order as the parameters), after
+    /// [`Self::backward`] of each.
+    #[inline(always)]
+    pub fn accumulate<S: Simd>(
+        &self,
+        simd: S,
+        unit: &Unit,
+        packed: &Packed,
+        a: &mut Activations,
+        tiles: usize,
+        out: &mut [f32],
+    ) {
+        match packed {
+            Packed::Vector(_) => {
+                let view = |data| TileView { data, stride: a.stride, offset: 0 };
+                vector::accumulate(simd, &self.layers, view(&a.values), view(&a.grads), tiles, out);
+            }
+            Packed::Matrix(packed) => packed.accumulate(unit, &self.layers, &mut a.saved, tiles, out),
+        }
+    }
+}
+
+/// Where one layer's numbers are.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Layer {
+    n_in: usize,
+    n_out: usize,
+    /// First activation row of its input.
+    row: usize,
+    /// Offset in the flat parameters.
+    param: usize,
+    /// Offset among all weights.
+    weight: usize,
+    /// Offset among all biases.
+    bias: usize,
+}
+
+impl Layer {
+    fn weights(&self) -> usize {
+        self.n_in * self.n_out
+    }
+}
+
+/// Weights in the orders that the kernels stream through.
+pub enum Packed {
+    /// For [`Precision::F32`].
+    Vector(vector::Packed),
+    /// For [`Precision::Bf16`].
+    Matrix(matrix::Packed),
+}
+
+/// Activations of a chunk of tiles, and their gradients.
+#[derive(Default)]
+pub struct Activations {
+    /// Per tile `input | layer 1 | ... | output`; in bf16 all tiles share `input | output`.
+    values: AlignedVec,
+    grads: AlignedVec,
+    /// Floats from one tile to the next, and of one tile.
+    stride: usize,
+    end: usize,
+    /// Floats of a tile's input and output.
+    input: usize,
+    output: usize,
+    saved: matrix::Saved,
+}
+
+impl Activations {
+    /// Input rows of tile `n`, to be filled.
+    #[inline(always)]
+    pub fn input(&mut self, n: usize) -> &mut [f32] {
+        &mut self.values[n * self.stride..][..self.input]
+    }
+
+    /// Output rows of tile `n`; in bf16 only until the next tile is evaluated.
+    #[inline(always)]
+    pub fn output(&self, n: usize) -> &[f32] {
+        &self.values[n * self.stride + self.end - self.output..][..self.output]
+    }
+
+    /// Gradient of the output rows of tile `n`, to be filled.
+    #[inline(always)]
+    pub fn output_grad(&mut self, n: usize) -> &mut [f32] {
+        &mut self.grads[n * self.stride + self.end - self.output..][..self.output]
+    }
+
+    /// Gradient of the input rows of tile `n`; in bf16 only until the next tile goes backward.
+    #[inline(always)]
+    pub fn input_grad(&self, n: usize) -> &[f32] {
+        &self.grads[n * self.stride..][..self.input]
+    }
+}

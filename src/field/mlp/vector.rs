@@ -1,0 +1,194 @@
+//! Networks in f32, on vectors of samples.
+//!
+//! A tile holds all its layers one after the other: `input | layer 1 | layer 2 | ...`, gradients likewise.
+
+use pulp::Simd;
+
+use super::{BLOCK, Layer};
+use crate::simd::TILE;
+
+/// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
+pub struct Packed {
+    forward: Vec<f32>,
+    backward: Vec<f32>,
+    bias: Vec<f32>,
+}
+
+impl Packed {
+    pub(super) fn new(layers: &[Layer], params: &[f32]) -> Self {
+        let mut packed = Self { forward: Vec::new(), backward: Vec::new(), bias: Vec::new() };
+        for layer in layers {
+            let (w, b) = params[layer.param..].split_at(layer.weights());
+            packed.bias.extend_from_slice(&b[..layer.n_out]);
+            for o in (0..layer.n_out).step_by(BLOCK) {
+                for i in 0..layer.n_in {
+                    packed.forward.extend((0..BLOCK).map(|j| w[(o + j) * layer.n_in + i]));
+                }
+            }
+            for i in (0..layer.n_in).step_by(BLOCK) {
+                for o in 0..layer.n_out {
+                    packed.backward.extend((0..BLOCK).map(|j| w[o * layer.n_in + i + j]));
+                }
+            }
+        }
+        packed
+    }
+
+    /// Fills all rows below the input of one tile, `[rows][TILE]`.
+    #[inline(always)]
+    pub(super) fn forward<S: Simd>(&self, simd: S, layers: &[Layer], tile: &mut [f32]) {
+        for (n, layer) in layers.iter().enumerate() {
+            let (x, y) = tile[layer.row * TILE..].split_at_mut(layer.n_in * TILE);
+            let w = &self.forward[layer.weight..][..layer.weights()];
+            let bias = &self.bias[layer.bias..][..layer.n_out];
+            matmul(simd, w, bias, x, &mut y[..layer.n_out * TILE], n + 1 < layers.len());
+        }
+    }
+
+    /// Fills the gradient rows of one tile above the output, whose rows the caller has set.
+    #[inline(always)]
+    pub(super) fn backward<S: Simd>(&self, simd: S, layers: &[Layer], tile: &[f32], grad: &mut [f32]) {
+        for (n, layer) in layers.iter().enumerate().rev() {
+            let (dx, dy) = grad[layer.row * TILE..].split_at_mut(layer.n_in * TILE);
+            let w = &self.backward[layer.weight..][..layer.weights()];
+            matmul(simd, w, &[], &dy[..layer.n_out * TILE], dx, false);
+            if n > 0 {
+                let x = &tile[layer.row * TILE..][..layer.n_in * TILE];
+                for (d, x) in dx.iter_mut().zip(x) {
+                    *d = if *x > 0.0 { *d } else { 0.0 };
+                }
+            }
+        }
+    }
+}
+
+/// Adds the parameter gradients of a chunk of `count` tiles to `out` (same order as the parameters).
+#[inline(always)]
+pub(super) fn accumulate<S: Simd>(
+    simd: S,
+    layers: &[Layer],
+    tiles: TileView,
+    grads: TileView,
+    count: usize,
+    out: &mut [f32],
+) {
+    for layer in layers {
+        let (gw, gb) = out[layer.param..].split_at_mut(layer.weights());
+        let x = tiles.rows(layer.row);
+        let dy = grads.rows(layer.row + layer.n_in);
+        for o in (0..layer.n_out).step_by(BLOCK) {
+            bias_gradient(simd, dy.rows(o), count, &mut gb[o..o + BLOCK]);
+            for i in (0..layer.n_in).step_by(BLOCK) {
+                let block = outer_product(simd, dy.rows(o), x.rows(i), count);
+                for (j, row) in block.iter().enumerate() {
+                    for (k, v) in row.iter().enumerate() {
+                        gw[(o + j) * layer.n_in + i + k] += v;
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The same rows of many tiles: `data[tile * stride + row * TILE ..]`.
+#[derive(Clone, Copy)]
+pub struct TileView<'a> {
+    /// Tiles one after the other.
+    pub data: &'a [f32],
+    /// Floats from one tile to the next.
+    pub stride: usize,
+    /// Float offset of row 0 within a tile.
+    pub offset: usize,
+}
+
+impl<'a> TileView<'a> {
+    #[inline(always)]
+    fn rows(self, row: usize) -> Self {
+        Self { offset: self.offset + row * TILE, ..self }
+    }
+
+    #[inline(always)]
+    fn block<S: Simd>(self, tile: usize) -> &'a [S::f32s] {
+        S::as_simd_f32s(&self.data[tile * self.stride + self.offset..][..BLOCK * TILE]).0
+    }
+}
+
+/// y = relu?(W x + b) for one tile; `w` is packed four outputs side by side.
+#[inline(always)]
+fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], relu: bool) {
+    let vectors = TILE / S::F32_LANES;
+    let n_in = x.len() / TILE;
+    let x = S::as_simd_f32s(x).0;
+    let y = S::as_mut_simd_f32s(y).0;
+    let zero = simd.splat_f32s(0.0);
+    for group in (0..vectors).step_by(3) {
+        for (block, w) in w.chunks_exact(BLOCK * n_in).enumerate() {
+            let mut acc = [[zero; 3]; BLOCK];
+            if let Some(b) = bias.get(block * BLOCK..(block + 1) * BLOCK) {
+                for (a, b) in acc.iter_mut().zip(b) {
+                    *a = [simd.splat_f32s(*b); 3];
+                }
+            }
+            for (w, x) in w.chunks_exact(BLOCK).zip(x.chunks_exact(vectors)) {
+                let x = [x[group], x[group + 1], x[group + 2]];
+                for j in 0..BLOCK {
+                    let w = simd.splat_f32s(w[j]);
+                    for v in 0..3 {
+                        acc[j][v] = simd.mul_add_e_f32s(w, x[v], acc[j][v]);
+                    }
+                }
+            }
+            for (j, a) in acc.iter().enumerate() {
+                let out = &mut y[(block * BLOCK + j) * vectors + group..][..3];
+                for v in 0..3 {
+                    out[v] = if relu { simd.max_f32s(a[v], zero) } else { a[v] };
+                }
+            }
+        }
+    }
+}
+
+/// Σ over samples of dy[j] x[k] for a 4 × 4 block.
+#[inline(always)]
+fn outer_product<S: Simd>(simd: S, dy: TileView, x: TileView, count: usize) -> [[f32; BLOCK]; BLOCK] {
+    let vectors = TILE / S::F32_LANES;
+    let mut acc = [[simd.splat_f32s(0.0); BLOCK]; BLOCK];
+    for tile in 0..count {
+        let dy = dy.block::<S>(tile);
+        let x = x.block::<S>(tile);
+        for v in 0..vectors {
+            let d = [dy[v], dy[vectors + v], dy[2 * vectors + v], dy[3 * vectors + v]];
+            let x = [x[v], x[vectors + v], x[2 * vectors + v], x[3 * vectors + v]];
+            for j in 0..BLOCK {
+                for k in 0..BLOCK {
+                    acc[j][k] = simd.mul_add_e_f32s(d[j], x[k], acc[j][k]);
+                }
+            }
+        }
+    }
+    // Plain loops: a closure behind `map` may be compiled without the caller's vector features.
+    let mut sums = [[0.0; BLOCK]; BLOCK];
+    for j in 0..BLOCK {
+        for k in 0..BLOCK {
+            sums[j][k] = simd.reduce_sum_f32s(acc[j][k]);
+        }
+    }
+    sums
+}
+
+#[inline(always)]
+fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut [f32]) {
+    let vectors = TILE / S::F32_LANES;
+    let mut acc = [simd.splat_f32s(0.0); BLOCK];
+    for tile in 0..count {
+        let dy = dy.block::<S>(tile);
+        for (j, a) in acc.iter_mut().enumerate() {
+            for v in 0..vectors {
+                *a = simd.add_f32s(*a, dy[j * vectors + v]);
+            }
+        }
+    }
+    for j in 0..BLOCK {
+        out[j] += simd.reduce_sum_f32s(acc[j]);
+    }
+}

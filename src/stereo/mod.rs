@@ -1,0 +1,154 @@
+//! Depth of posed frames by comparing them with their neighbours: plane sweep, semi-global aggregation and a check
+//! of the frames against each other.
+//!
+//! Colour alone leaves a field free to put fog in front of what it cannot tell apart; two views of the same texture
+//! do not. The depth found here is coarse and has holes where nothing moves against the background or nothing is
+//! textured, but where it is, it is right: training starts from it ([`crate::train::loss`]).
+
+mod aggregate;
+mod consistency;
+mod rig;
+mod sweep;
+#[cfg(test)]
+mod tests;
+
+use glam::{DAffine3, Vec2, Vec3};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use self::rig::WorkView;
+use crate::config::ConfigError;
+use crate::scene::Camera;
+
+/// Settings of the stereo depth.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StereoConfig {
+    /// Longest side of the images that are compared, px; larger ones are reduced.
+    pub size: u32,
+    /// Depths that are tried, evenly spaced in inverse depth.
+    pub depths: usize,
+    /// Closest depth that is tried, as a fraction of the farthest.
+    pub nearest: f32,
+    /// Frames that each frame is compared with.
+    pub neighbours: usize,
+    /// Two frames agree on a point if its inverse depths differ by less than this fraction.
+    pub tolerance: f32,
+    /// Frames that must agree with a frame's depth of a pixel.
+    pub agreeing: usize,
+}
+
+impl Default for StereoConfig {
+    fn default() -> Self {
+        Self { size: 160, depths: 96, nearest: 0.06, neighbours: 4, tolerance: 0.02, agreeing: 2 }
+    }
+}
+
+impl StereoConfig {
+    /// Checks every number's range.
+    ///
+    /// # Errors
+    /// [`ConfigError::Range`] names the first setting that is out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let range = |key, value: String, ok: bool, remedy| match ok {
+            true => Ok(()),
+            false => Err(ConfigError::Range { key, value, remedy }),
+        };
+        range("stereo.size", self.size.to_string(), (16..=1024).contains(&self.size), "must be 16 to 1024")?;
+        let depths = (8..=512).contains(&self.depths);
+        range("stereo.depths", self.depths.to_string(), depths, "must be 8 to 512")?;
+        let nearest = self.nearest > 0.0 && self.nearest < 1.0;
+        range("stereo.nearest", self.nearest.to_string(), nearest, "must lie between 0 and 1")?;
+        let neighbours = (1..=sweep::MOST_NEIGHBOURS).contains(&self.neighbours);
+        range("stereo.neighbours", self.neighbours.to_string(), neighbours, "must be 1 to 16")?;
+        let tolerance = self.tolerance > 0.0 && self.tolerance.is_finite();
+        range("stereo.tolerance", self.tolerance.to_string(), tolerance, "must be positive")
+    }
+}
+
+/// What is compared: one frame's pixels and where they were taken from.
+#[derive(Clone, Copy)]
+pub struct StereoFrame<'a> {
+    /// Intrinsics of the image.
+    pub camera: &'a Camera,
+    /// Camera to a common frame; its length unit is the one of all depths here.
+    pub c2w: DAffine3,
+    /// sRGB, row-major.
+    pub rgb: &'a [[u8; 3]],
+}
+
+/// Depth of one frame on a reduced, undistorted image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StereoDepth {
+    width: usize,
+    height: usize,
+    focal: Vec2,
+    principal: Vec2,
+    /// Refinement of the lens that the directions asked for do not have yet.
+    lens: [f32; 2],
+    /// Depth along the camera's axis; 0 where it is not known. `[height * width]`.
+    pub depth: Vec<f32>,
+}
+
+impl StereoDepth {
+    /// The same depth at every pixel of a pinhole.
+    #[cfg(test)]
+    pub(crate) fn flat(camera: &Camera, depth: f32) -> Self {
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        let focal = Vec2::new(camera.fx as f32, camera.fy as f32);
+        let principal = Vec2::new(camera.cx as f32, camera.cy as f32);
+        Self { width, height, focal, principal, lens: [0.0; 2], depth: vec![depth; width * height] }
+    }
+
+    /// Depth along the camera's axis in the direction `dir` (camera axes); `None` where it is not known.
+    pub fn at(&self, dir: Vec3) -> Option<f32> {
+        let slope = dir.truncate() / dir.z;
+        let [focal, radial] = self.lens;
+        let p = slope * (1.0 + focal + radial * slope.length_squared()) * self.focal + self.principal;
+        let inside = dir.z > 0.0
+            && p.cmpge(Vec2::ZERO).all()
+            && p.cmplt(Vec2::new(self.width as f32, self.height as f32)).all();
+        let depth = if inside { self.depth[p.y as usize * self.width + p.x as usize] } else { 0.0 };
+        (depth > 0.0).then_some(depth)
+    }
+
+    /// From now on directions are given as they are before a field's refinement of the lens
+    /// ([`crate::render::rays::View::lens`]).
+    pub fn refine(&mut self, lens: [f32; 2]) {
+        self.lens = lens;
+    }
+
+    /// Share of pixels with a depth.
+    pub fn coverage(&self) -> f64 {
+        let known = self.depth.iter().filter(|d| **d > 0.0).count();
+        known as f64 / self.depth.len().max(1) as f64
+    }
+}
+
+/// Depth of every frame, up to `farthest`; all zero for a frame that shares no view with another.
+///
+/// Deterministic, whatever the number of threads.
+pub fn depths(frames: &[StereoFrame], farthest: f32, config: &StereoConfig) -> Vec<StereoDepth> {
+    let views: Vec<WorkView> = frames.par_iter().map(|f| WorkView::new(f, config.size)).collect();
+    let planes = sweep::Planes::new(config.nearest * farthest, farthest, config.depths);
+    let neighbours: Vec<Vec<usize>> =
+        (0..views.len()).into_par_iter().map(|n| rig::neighbours(&views, n, &planes, config)).collect();
+    let raw: Vec<Vec<f32>> = (0..views.len())
+        .into_par_iter()
+        .map(|n| sweep::inverse_depth(&views, n, &neighbours[n], &planes))
+        .collect();
+    (0..views.len())
+        .into_par_iter()
+        .map(|n| {
+            let v = &views[n];
+            StereoDepth {
+                width: v.width,
+                height: v.height,
+                focal: v.focal,
+                principal: v.principal,
+                lens: [0.0; 2],
+                depth: consistency::keep_agreeing(&views, &raw, n, &neighbours[n], config),
+            }
+        })
+        .collect()
+}

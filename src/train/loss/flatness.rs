@@ -1,0 +1,99 @@
+//! Surfaces are flat where pictures are.
+//!
+//! The inverse z-depth of a plane is affine in the pixel, so three pixels in a row of a patch that see one plane have
+//! disparities on a line. What bends it costs up to a bounded price, since surfaces do end; where the picture changes, too,
+//! less (Heise et al. 2013, "PM-Huber", and the edge-aware terms of self-supervised depth). It carries depth
+//! from the borders of a door or a wall into its middle, where nothing else tells it.
+
+use super::RayTarget;
+use crate::render::forward::{Chunk, RayInput};
+
+/// Relative bend up to which the price grows with its square.
+pub const SMALL: f32 = 0.002;
+
+/// Relative bend at which half of the price is reached.
+pub const LARGE: f32 = 0.02;
+
+/// Contrast between neighbours (sRGB 0–1) at which a bend costs 1/e as much.
+const CONTRAST: f32 = 0.06;
+
+/// Three rays of a chunk through pixels in a row, equally far apart.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bend {
+    /// Their numbers in the chunk.
+    pub rays: [usize; 3],
+    /// How little the picture changes between them, 0 to 1.
+    pub weight: f32,
+}
+
+/// The rows and columns of three in the patches (`side`² rays each) that a chunk consists of.
+pub fn find(rays: &[RayInput], targets: &[RayTarget], side: usize, out: &mut Vec<Bend>) {
+    out.clear();
+    for first in (0..rays.len() / (side * side)).map(|n| n * side * side) {
+        for (line, at) in (0..side).flat_map(|l| (0..side.saturating_sub(2)).map(move |a| (l, a))) {
+            let across = std::array::from_fn(|k| first + line * side + at + k);
+            let down = std::array::from_fn(|k| first + (at + k) * side + line);
+            for triple in [across, down] {
+                if is_straight(triple.map(|r| &rays[r])) {
+                    out.push(Bend { rays: triple, weight: evenness(triple.map(|r| &targets[r])) });
+                }
+            }
+        }
+    }
+}
+
+/// Patches are cut off at borders and masks; what is left of a row there may not be one.
+fn is_straight([a, b, c]: [&RayInput; 3]) -> bool {
+    let off = a.uv + c.uv - 2.0 * b.uv;
+    a.view == c.view && a.uv != b.uv && off.abs().max_element() < 1e-5
+}
+
+fn evenness([a, b, c]: [&RayTarget; 3]) -> f32 {
+    let step = |a: &RayTarget, b: &RayTarget| (0..3).map(|k| (a.rgb[k] - b.rgb[k]).abs()).fold(0.0, f32::max);
+    (-step(a, b).max(step(b, c)) / CONTRAST).exp()
+}
+
+/// Price of all bends, summed; writes its gradient (times `scale`) with respect to the disparity of each ray.
+///
+/// The disparity by which a bend is measured is taken as a constant.
+pub fn backward(
+    price: f32,
+    chunk: &Chunk,
+    bends: &[Bend],
+    count: usize,
+    scale: f32,
+    grad: &mut Vec<f32>,
+) -> f32 {
+    grad.clear();
+    grad.resize(chunk.rays.len(), 0.0);
+    if price == 0.0 {
+        return 0.0;
+    }
+    let disparity: Vec<f32> = (0..chunk.rays.len()).map(|r| disparity(chunk, r, count)).collect();
+    let mut sum = 0.0;
+    for bend in bends {
+        let [a, b, c] = bend.rays.map(|r| disparity[r]);
+        let level = level([a, b, c]);
+        let relative = (a - 2.0 * b + c) / level;
+        let size = (relative * relative + SMALL * SMALL).sqrt();
+        let weight = price * bend.weight;
+        sum += weight * (size - SMALL) / (size + LARGE);
+        let d = scale * weight * (SMALL + LARGE) / (size + LARGE).powi(2) * relative / (size * level);
+        for (r, share) in bend.rays.into_iter().zip([1.0, -2.0, 1.0]) {
+            grad[r] += share * d;
+        }
+    }
+    sum
+}
+
+/// Expected inverse z-depth of ray `r`, 1/units; what passes the box is at infinity.
+pub fn disparity(chunk: &Chunk, r: usize, count: usize) -> f32 {
+    let range = r * count..(r + 1) * count;
+    let sum = chunk.intervals[range.clone()].iter().zip(&chunk.weighted[range]).map(|(i, w)| w.total() / i.t);
+    sum.sum::<f32>() / chunk.rays[r].ray.refined_cam.z
+}
+
+/// What a bend is measured by: the mean disparity of its rays.
+pub fn level(disparities: [f32; 3]) -> f32 {
+    disparities.iter().sum::<f32>() / 3.0 + 1e-3
+}

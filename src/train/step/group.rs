@@ -1,0 +1,305 @@
+//! The rays of one group: chosen, traced, and back-propagated to everything but the tables.
+
+use glam::{Vec2, Vec3};
+use pulp::Simd;
+
+use super::{CHUNK_RAYS, StepPlan};
+use crate::field::stream::StreamBatch;
+use crate::render::density_grid::DensityGrid;
+use crate::render::forward::{Chunk, Model, RayInput, Tracer};
+use crate::render::rays::View;
+use crate::rng::Rng;
+use crate::simd::TILE;
+use crate::train::loss::flatness::{self, Bend};
+use crate::train::loss::{self, ChunkGradient, ChunkLoss, LossConfig, RayTarget};
+use crate::train::pixels::PixelSet;
+
+/// Random cells of each density grid that a group looks at in a step.
+const REFRESH_CELLS: usize = 2 * TILE;
+
+/// How fast the density grids follow those looks.
+const REFRESH_RATE: f32 = 0.3;
+
+/// Pixels of a patch are 1, 2, 4 ... (this many powers of two) apart.
+const PATCH_STRIDES: usize = 4;
+
+/// What all groups read.
+pub struct Context<'a> {
+    pub model: &'a Model<'a>,
+    pub pixels: &'a PixelSet,
+    pub views: &'a [View],
+    pub config: &'a LossConfig,
+    pub plan: &'a StepPlan,
+    pub seed: u64,
+    pub rays: usize,
+}
+
+/// One chunk of rays of a step.
+#[derive(Default)]
+pub struct TrainChunk {
+    pub inputs: Vec<RayInput>,
+    pub targets: Vec<RayTarget>,
+    pub bends: Vec<Bend>,
+    pub traced: Chunk,
+}
+
+/// Chunks that one task works on, and its buffers, kept from step to step.
+#[derive(Default)]
+pub struct Group {
+    pub chunks: Vec<TrainChunk>,
+    refresh: [Refresh; 3],
+    tracer: Tracer,
+    gradient: ChunkGradient,
+    /// Gradient of the dense weights.
+    pub dense: Vec<f32>,
+    pub loss: ChunkLoss,
+    pub evaluations: usize,
+}
+
+impl Group {
+    /// Chooses the rays of `chunks` chunks, the first of which has the number `first`, and places their samples.
+    #[inline(always)]
+    pub fn place(&mut self, context: &Context, first: usize, chunks: usize) {
+        self.chunks.resize_with(chunks, TrainChunk::default);
+        for (n, chunk) in self.chunks.iter_mut().enumerate() {
+            chunk.choose_rays(context, first + n);
+            chunk.place(context, &mut self.tracer, first + n);
+        }
+        let mut rng = Rng::new(context.seed, context.plan.step, u64::MAX - first as u64);
+        for (s, refresh) in self.refresh.iter_mut().enumerate() {
+            refresh.place(context, s, &mut rng);
+        }
+    }
+
+    /// All samples that are evaluated, with the number of their stream.
+    pub fn batches(&mut self) -> impl Iterator<Item = (usize, &mut StreamBatch)> {
+        let chunks = self.chunks.iter_mut().flat_map(|c| c.traced.batches.iter_mut().enumerate());
+        chunks.chain(self.refresh.iter_mut().map(|r| &mut r.batch).enumerate())
+    }
+
+    /// Evaluates the encoded samples and goes all the way back to their encodings.
+    #[inline(always)]
+    pub fn evaluate<S: Simd>(&mut self, simd: S, context: &Context) {
+        let Self { chunks, refresh, tracer, gradient, dense, loss, evaluations } = self;
+        dense.clear();
+        dense.resize(context.model.field.layout.len, 0.0);
+        (*loss, *evaluations) = (ChunkLoss::default(), 0);
+        for chunk in chunks {
+            let l = chunk.evaluate(simd, context, tracer, gradient);
+            loss.total += l.total;
+            loss.squared += l.squared;
+            *evaluations += chunk.traced.batches.iter().map(StreamBatch::len).sum::<usize>();
+            chunk.backward(simd, context, tracer, gradient, dense);
+        }
+        for (s, refresh) in refresh.iter_mut().enumerate() {
+            refresh.evaluate(simd, context, s, tracer);
+        }
+    }
+
+    /// Tells the density grid of stream `s` what densities were seen.
+    pub fn tell(&self, s: usize, views: &[View], grid: &mut DensityGrid, rate: f32) {
+        for chunk in &self.chunks {
+            let traced = &chunk.traced;
+            // All samples of a ray share its time.
+            let count = traced.intervals.len() / chunk.inputs.len().max(1);
+            let slice = |k: usize| grid.slice(views[chunk.inputs[k / count].view as usize].time);
+            let slices: Vec<usize> = (0..traced.intervals.len()).step_by(count.max(1)).map(slice).collect();
+            for (k, p) in traced.batches[s].points() {
+                grid.observe(p, slices[k / count], traced.samples[s].sigma[k], rate);
+            }
+        }
+    }
+
+    /// Tells the density grid of stream `s` what its random cells hold.
+    pub fn tell_refreshed(&self, s: usize, grid: &mut DensityGrid) {
+        let Refresh { batch, slices, sigma, .. } = &self.refresh[s];
+        for (k, p) in batch.points() {
+            grid.observe(p, slices[k], sigma[k], REFRESH_RATE);
+        }
+    }
+}
+
+impl TrainChunk {
+    pub fn choose_rays(&mut self, context: &Context, chunk: usize) {
+        self.inputs.clear();
+        self.targets.clear();
+        let pixels = context.pixels;
+        let side = context.plan.patch;
+        let mut rng = Rng::new(context.seed, context.plan.step, chunk as u64);
+        let mut corner = (0, 0, 1);
+        for k in 0..CHUNK_RAYS {
+            let in_patch = k as u32 % (side * side);
+            if in_patch == 0 {
+                corner = loop {
+                    let frame = rng.below(pixels.frames.len());
+                    if let Some(pixel) = pixels.pick(frame, rng.uniform()) {
+                        break (frame, pixel, 1 << rng.below(PATCH_STRIDES));
+                    }
+                };
+            }
+            let (frame, first, stride) = corner;
+            let camera = &pixels.frames[frame].camera;
+            let x = (first as u32 % camera.width + in_patch % side * stride).min(camera.width - 1);
+            let y = (first as u32 / camera.width + in_patch / side * stride).min(camera.height - 1);
+            let pixel = match pixels.is_usable(frame, x + y * camera.width) {
+                true => (x + y * camera.width) as usize,
+                false => first,
+            };
+            let (x, y) = (pixel as u32 % camera.width, pixel as u32 / camera.width);
+            let uv =
+                Vec2::new((x as f32 + 0.5) / camera.width as f32, (y as f32 + 0.5) / camera.height as f32);
+            self.inputs.push(RayInput {
+                view: frame as u32,
+                dir_cam: pixels.directions(frame)[pixel],
+                uv,
+                jitter: rng.uniform(),
+            });
+            let field = context.model.field;
+            let mut exposure = [0.0; 6];
+            let gamma = &field.weights[field.layout.exposure.clone()];
+            field.exposure.evaluate(gamma, context.views[frame].knots, &mut exposure);
+            self.targets.push(RayTarget {
+                rgb: pixels.images[frame][pixel].map(|c| f32::from(c) / 255.0),
+                background: [rng.uniform(), rng.uniform(), rng.uniform()],
+                exposure,
+                depth: pixels.stereo_distance(frame, pixel),
+            });
+        }
+        flatness::find(&self.inputs, &self.targets, side as usize, &mut self.bends);
+    }
+
+    /// Places the samples of the chunk with number `number`.
+    #[inline(always)]
+    pub fn place(&mut self, context: &Context, tracer: &mut Tracer, number: usize) {
+        let plan = context.plan;
+        self.traced.place(tracer, context.model, context.views, &self.inputs, &plan.sampling);
+        // Poses change slowly and their gradient costs time: a quarter of the chunks is enough.
+        let refine = plan.pose_rate > 0.0 || plan.rig_rate > 0.0;
+        let slopes = refine && (number as u64 + plan.step).is_multiple_of(4);
+        // The actor's coordinates are the camera's: they do not depend on its pose.
+        for (batch, slopes) in self.traced.batches.iter_mut().zip([slopes, slopes, false]) {
+            batch.slopes = slopes;
+        }
+    }
+
+    /// Evaluates the streams and the loss.
+    #[inline(always)]
+    pub fn evaluate<S: Simd>(
+        &mut self,
+        simd: S,
+        context: &Context,
+        tracer: &mut Tracer,
+        gradient: &mut ChunkGradient,
+    ) -> ChunkLoss {
+        let count = context.plan.sampling.count;
+        self.traced.evaluate(simd, tracer, context.model, count);
+        let scale = 1.0 / context.rays as f32;
+        loss::backward(context.config, &self.traced, &self.targets, &self.bends, count, scale, gradient)
+    }
+
+    /// Adds the gradients of all dense weights to `dense`, and leaves those of the encodings in the batches.
+    #[inline(always)]
+    pub fn backward<S: Simd>(
+        &mut self,
+        simd: S,
+        context: &Context,
+        tracer: &mut Tracer,
+        gradient: &ChunkGradient,
+        dense: &mut [f32],
+    ) {
+        let Self { inputs, traced, .. } = self;
+        let model = context.model;
+        let field = model.field;
+        let refine = traced.batches.iter().any(|b| b.slopes);
+        let mut rays = vec![(Vec3::ZERO, Vec3::ZERO); if refine { inputs.len() } else { 0 }];
+        for s in 0..3 {
+            let batch = &mut traced.batches[s];
+            let (Some(net), Some(w)) = (&field.nets[s], model.weights(s)) else { continue };
+            if batch.is_empty() {
+                continue;
+            }
+            let r = &field.layout.streams[s];
+            let mut codes = vec![0.0; inputs.len() * net.code];
+            // Trunk and head follow one another in the layout.
+            let (trunk, head) = dense[r.trunk.start..r.head.end].split_at_mut(r.trunk.len());
+            net.backward(
+                simd,
+                &w,
+                batch,
+                &mut tracer.activations[s],
+                &traced.samples[s],
+                &gradient.samples[s],
+                [trunk, head],
+                |ray, k, g| codes[ray * net.code + k] += g,
+                |ray, sample, g| {
+                    let (origin, dir) = &mut rays[ray];
+                    *origin += g;
+                    *dir += g * traced.intervals[sample].t;
+                },
+            );
+            if let Some(code) = &field.codes[s] {
+                let gamma = &mut dense[r.code.clone()];
+                for (input, g) in inputs.iter().zip(codes.chunks_exact(code.width)) {
+                    if let Some(at) = context.views[input.view as usize].code_knots[s] {
+                        code.backward(at, g, gamma);
+                    }
+                }
+            }
+        }
+        let exposure = &mut dense[field.layout.exposure.clone()];
+        for (input, g) in inputs.iter().zip(&gradient.exposure) {
+            field.exposure.backward(context.views[input.view as usize].knots, g, exposure);
+        }
+        for ((input, ray), (d_origin, d_dir)) in inputs.iter().zip(&traced.rays).zip(rays) {
+            let view = &context.views[input.view as usize];
+            let (g, lens) = view.backward(&ray.ray, d_origin, d_dir);
+            field.pose.backward(view.knots, &g, &mut dense[field.layout.pose.clone()]);
+            let rig = &mut dense[field.layout.rig.clone()];
+            for (r, g) in rig.iter_mut().zip(g) {
+                *r += g;
+            }
+            rig[6] += lens[0];
+            rig[7] += lens[1];
+        }
+    }
+}
+
+/// Random cells of one density grid, looked at so that what was empty can fill again.
+#[derive(Default)]
+struct Refresh {
+    batch: StreamBatch,
+    codes: Vec<f32>,
+    slices: Vec<usize>,
+    sigma: Vec<f32>,
+}
+
+impl Refresh {
+    fn place(&mut self, context: &Context, s: usize, rng: &mut Rng) {
+        let field = context.model.field;
+        self.batch.clear();
+        self.slices.clear();
+        let (true, Some(net)) = (context.plan.streams[s], &field.nets[s]) else { return };
+        let grid = &context.model.grids.streams[s];
+        self.codes.resize(REFRESH_CELLS * net.code, 0.0);
+        for k in 0..REFRESH_CELLS {
+            let cell = rng.below(grid.sigma.len());
+            let u = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform());
+            let (p, time) = grid.point(cell, u, rng.uniform());
+            self.batch.push(k, k, p, time);
+            self.slices.push(grid.slice(time));
+            if let Some(code) = &field.codes[s] {
+                let gamma = &field.weights[field.layout.streams[s].code.clone()];
+                code.evaluate(gamma, code.locate(time), &mut self.codes[k * net.code..][..net.code]);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn evaluate<S: Simd>(&mut self, simd: S, context: &Context, s: usize, tracer: &mut Tracer) {
+        let Self { batch, codes, sigma, .. } = self;
+        let (Some(net), Some(w)) = (&context.model.field.nets[s], context.model.weights(s)) else { return };
+        sigma.resize(batch.len(), 0.0);
+        let code = |k: usize| &codes[k * net.code..];
+        net.density(simd, &w, batch, &mut tracer.activations[s], code, sigma);
+    }
+}
