@@ -152,6 +152,9 @@ def main():
         sub.add_argument("--checkpoint", required=True, help="file of weights")
         sub.add_argument("--out", required=True, help="folder to write to")
     args = parser.parse_args()
+    for path in (args.checkpoint, getattr(args, "vocab", None)):
+        if path and not os.path.isfile(path):
+            parser.error(f"{path} does not exist")
     if args.which == "clip":
         import open_clip
         module = load_clip(args.model, args.checkpoint)

@@ -61,8 +61,10 @@ def open_scene(root, split):
     path = f"{root}/transforms.json"
     if not os.path.isfile(path):
         stop(f"{path} does not exist; features are extracted for scenes in nerfstudio's format")
-    scene = json.load(open(path))
-    listed = scene["frames"]
+    scene = read_json(path)
+    listed = scene.get("frames")
+    if not listed or not all("file_path" in f for f in listed):
+        stop(f"{path}: no `frames`, or some without `file_path`")
     test = scene.get("test_filenames") or scene.get("val_filenames")
     frames = []
     for n, frame in enumerate(listed):
@@ -78,8 +80,21 @@ def open_scene(root, split):
     return frames, [f for f in frames if split == "all" or not f["test"]]
 
 
+def read_json(path):
+    try:
+        found = json.load(open(path, encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        stop(f"{path}: {error}")
+    if not isinstance(found, dict):
+        stop(f"{path}: not an object in braces")
+    return found
+
+
 def read_image(path):
-    return np.asarray(Image.open(path).convert("RGB"))
+    try:
+        return np.asarray(Image.open(path).convert("RGB"))
+    except (OSError, SyntaxError) as error:
+        stop(f"{path}: {error}")
 
 
 # Files: complete or not there.
@@ -101,11 +116,13 @@ def save(path, array):
     atomically(path, lambda file: np.save(file, np.ascontiguousarray(array)))
 
 
-def unit(features, what):
-    """Rows of unit length as f16; a row that is zero or not finite stays as it is and is named."""
-    features = np.asarray(features, np.float32)
-    norm = np.linalg.norm(features, axis=-1, keepdims=True)
-    bad = ~np.isfinite(features).all(-1) | (norm[..., 0] == 0)
+def describe(model, items, what):
+    """A model's descriptors of items as f16, of unit length; one that is zero or not finite stays and is named."""
+    features = np.asarray(model(items), np.float32)
+    if features.ndim != 2 or len(features) != len(items) or not features.size:
+        stop(f"{what}: the model gave an array {features.shape} for {len(items)} items, not [{len(items)}, D]")
+    norm = np.linalg.norm(features, axis=1, keepdims=True)
+    bad = ~np.isfinite(features).all(1) | (norm[:, 0] == 0)
     if bad.any():
         warn(f"{what}: {int(bad.sum())} of {bad.size} descriptors are zero or not finite")
     return np.where(norm > 0, features / np.where(norm > 0, norm, 1), features).astype(np.float16)
@@ -121,7 +138,7 @@ class Folder:
         meta = f"{self.path}/meta.json"
         settings = json.loads(json.dumps(settings))
         if os.path.isfile(meta) and not force:
-            old = json.load(open(meta))
+            old = read_json(meta)
             # What was not said, or is not said now, contradicts nothing: masks may come after patches.
             said = {k: v for k, v in settings.items() if v not in ("", [])}
             differing = [k for k in said if old.get(k, "") not in ("", [], said[k])]
@@ -191,8 +208,8 @@ def language(image, stem, models, folder):
         x0, y0, x1, y1 = box_of(mask)
         alone.append(square(np.where(mask[..., None], image, 0)[y0:y1, x0:x1]))
         boxed.append(square(image[y0:y1, x0:x1]))
-    folder.save(stem, "_b", unit(models["image"](boxed), f"{stem}, boxes"))
-    folder.save(stem, "_f", unit(models["image"](alone), f"{stem}, masks"))
+    folder.save(stem, "_b", describe(models["image"], boxed, f"{stem}, boxes"))
+    folder.save(stem, "_f", describe(models["image"], alone, f"{stem}, masks"))
     folder.save(stem, "_s", index_map(masks, image.shape[:2]))
 
 
@@ -215,7 +232,7 @@ def patch_layout(fraction, image_size, square_patches):
     return size, [s / 2 for s in size]
 
 
-def describe(part, fraction, image_size, square_patches):
+def layout_of(part, fraction, image_size, square_patches):
     size, stride = patch_layout(fraction, image_size, square_patches)
     xs, ys = grid(size, stride, image_size)
     return dict(file=part, fraction=fraction, size_px=size, stride_px=stride, origin_px=[0, 0], rows=len(ys),
@@ -233,7 +250,7 @@ def patches(image, stem, models, folder, layouts):
     for layout in layouts:
         part = "_" + layout["file"]
         if folder.missing(stem, [part]):
-            found = unit(models["image"](crops(image, layout)), f"{stem}, patches {part}")
+            found = describe(models["image"], crops(image, layout), f"{stem}, patches {part}")
             folder.save(stem, part, found.reshape(layout["rows"], layout["cols"], -1))
 
 
@@ -271,9 +288,9 @@ def video(frame, models, folder, clips, layout):
     if scale != [1, 1]:
         size = tuple(layout["image_size"])
         clip = np.stack([np.asarray(Image.fromarray(f).resize(size, Image.BILINEAR)) for f in clip])
-    found = unit(models["video"](crops(clip, layout)), f"{stem}, video patches")
+    found = describe(models["video"], crops(clip, layout), f"{stem}, video patches")
     folder.save(stem, "_p", found.reshape(layout["rows"], layout["cols"], -1))
-    folder.save(stem, "_g", unit(models["video"]([clip]), f"{stem}, clip")[0])
+    folder.save(stem, "_g", describe(models["video"], [clip], f"{stem}, clip")[0])
 
 
 # Hotspots and parts.
@@ -319,9 +336,14 @@ def load(kind, text, device):
 def settings_of(args, image_size):
     """What meta.json of each folder says."""
     name = lambda kind: os.path.basename(getattr(args, kind) or "")  # noqa: E731
-    scales = sorted(float(s) for s in args.patch_scales.split(",") if s)
-    pyramid = [describe(f"p{n}", s, image_size, True) for n, s in enumerate(scales)]
-    local = dict(describe("p", VIDEO_PATCH, image_size, False), image_size=image_size)
+    try:
+        scales = sorted(float(s) for s in args.patch_scales.split(",") if s)
+    except ValueError:
+        stop(f"--patch-scales {args.patch_scales}: write fractions of the height such as 0.15,0.33")
+    if not all(0 < s <= 1 for s in scales):
+        stop(f"--patch-scales {args.patch_scales}: fractions of the height are above 0 and at most 1")
+    pyramid = [layout_of(f"p{n}", s, image_size, True) for n, s in enumerate(scales)]
+    local = dict(layout_of("p", VIDEO_PATCH, image_size, False), image_size=image_size)
     common = dict(image_size=image_size, dtype="float16")
     return pyramid, local, dict(
         language_features=dict(common, model=name("image"), segmenter=name("segmenter"), patches=pyramid,
@@ -349,14 +371,15 @@ def main():
     every, frames = open_scene(args.scene, args.split)
     if not frames:
         stop(f"{args.scene}: no frames to look at")
-    image_size = list(Image.open(frames[0]["path"]).size)
+    image_size = list(read_image(frames[0]["path"]).shape[1::-1])
     pyramid, local, settings = settings_of(args, image_size)
     kinds = [k for k in ("segmenter", "image", "video", "hands", "parts") if getattr(args, k)]
     if not kinds:
         stop("no model given; see --help")
     folder_of = dict(image="language_features", video="video_features", hands="hotspots", parts="dino_features")
-    folders = {k: Folder(args.scene, name, settings[name], args.force) for k, name in folder_of.items() if k in kinds}
+    # Folders last: settings are written down once every model is there.
     models = {k: load(k, getattr(args, k), args.device) for k in kinds}
+    folders = {k: Folder(args.scene, name, settings[name], args.force) for k, name in folder_of.items() if k in kinds}
     clips = Clips(every, args.video_frames, args.video_fps) if "video" in models else None
     for n, frame in enumerate(frames):
         image, stem = read_image(frame["path"]), frame["stem"]

@@ -110,3 +110,32 @@ fn other_settings_are_refused_unless_forced() {
     assert!(!refused.status.success() && message.contains("another patches"), "{message}");
     assert_success(&extract(&path, 10_000, &["--patch-scales", "0.3", "--force"]));
 }
+
+#[test]
+fn what_is_wrong_is_said_in_one_line() {
+    let (_folder, path) = synth();
+    let models = root().join("tests/tools/standin_models.py");
+    let (lossy, absent) = (format!("{}:too_few=none", models.display()), "nothing.py:image=none".to_owned());
+    let refused = |more: &[&str], parts: &[&str]| {
+        let output = extract(&path, 10_000, more);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        let one_line =
+            message.starts_with("extract_features.py: ") && message.trim_end().lines().count() == 1;
+        assert!(!output.status.success() && one_line, "{message}");
+        assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+    };
+    refused(&["--patch-scales", "0.3,wide"], &["--patch-scales 0.3,wide"]);
+    refused(&["--patch-scales", "1.5"], &["at most 1"]);
+    refused(&["--image", &absent], &["--image", "nothing.py does not exist"]);
+    refused(&["--image", "openclip"], &["ADAPTER=WEIGHTS"]);
+    refused(&["--image", &lossy], &["the model gave an array (2, 16) for 3 items"]);
+    let meta = path.join("language_features/meta.json");
+    std::fs::write(&meta, "{").unwrap();
+    refused(&[], &["meta.json"]);
+    std::fs::remove_file(&meta).unwrap();
+    let transforms = path.join("transforms.json");
+    std::fs::write(&transforms, "{\"frames\": [{}]}").unwrap();
+    refused(&[], &["transforms.json", "file_path"]);
+    std::fs::remove_file(&transforms).unwrap();
+    refused(&[], &["transforms.json does not exist"]);
+}

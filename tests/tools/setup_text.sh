@@ -1,16 +1,37 @@
 #!/usr/bin/env bash
-# Makes text towers of the real architectures with random weights, and what PyTorch says about 200 phrases, for
-# tests/text_encoders.rs. Not part of tests/test.sh: PyTorch takes 6 GB where only its CUDA wheels are to be had (0.9 GB
-# with `--index-url https://download.pytorch.org/whl/cpu` in PIP_ARGS), the models another 1.4 GB.
+# Makes what tests/text_encoders.rs needs: PyTorch in `.venv-text` (5.5 GB on Linux, whose wheels bring CUDA's libraries),
+# then text towers of the real architectures with random weights and PyTorch's embeddings of 200 phrases in
+# `target/text-models` (1.4 GB). Does nothing when both are up to date.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
+tools=tests/tools
+venv=.venv-text
+models=target/text-models
 
-if [ ! -f .venv-text/stamp ]; then
-    rm -rf .venv-text
-    "${PYTHON:-python3}" -m venv .venv-text
-    # Unquoted on purpose: several arguments.
-    .venv-text/bin/python -m pip install --quiet --disable-pip-version-check ${PIP_ARGS:-} \
-        torch==2.15.0 open_clip_torch==3.3.0 transformers==5.23.0 onnx==1.23.2 onnxscript==0.7.2
-    touch .venv-text/stamp
+fail() {
+    echo "setup_text.sh: $*" >&2
+    exit 1
+}
+
+# Up to date: made from exactly these files, and complete (the stamp is written last).
+is_current() { [ -f "$1" ] && [ "$(cat "$1")" = "$2" ]; }
+
+wanted=$(sha256sum "$tools/requirements-text.txt")
+if ! is_current "$venv/stamp" "$wanted"; then
+    rm -rf "$venv"
+    "${PYTHON:-python3}" -m venv "$venv" || fail "cannot make a virtual environment; is python3-venv installed?"
+    # uv downloads and unpacks these 3 GB in about a minute, pip in ten.
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check uv==0.13.9
+    "$venv/bin/uv" pip install --quiet --no-cache --python "$venv/bin/python" --requirement \
+        "$tools/requirements-text.txt"
+    "$venv/bin/python" -c 'import onnx, onnxscript, open_clip, torch, transformers' ||
+        fail "a Python module does not load; the message above names what is missing"
+    echo "$wanted" >"$venv/stamp"
 fi
-.venv-text/bin/python tests/tools/text_models.py "${DIVFF_TEXT_MODELS:-target/text-models}"
+
+wanted=$(sha256sum "$tools/requirements-text.txt" "$tools/text_models.py" scripts/export_text_encoders.py)
+if ! is_current "$models/stamp" "$wanted"; then
+    rm -rf "$models"
+    "$venv/bin/python" "$tools/text_models.py" "$models"
+    echo "$wanted" >"$models/stamp"
+fi

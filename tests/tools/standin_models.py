@@ -48,6 +48,11 @@ def image(weights, device):
     return limited(lambda crops: np.stack([descriptor(c) for c in crops]))
 
 
+def too_few(weights, device):
+    """A model that loses a crop."""
+    return lambda crops: np.stack([descriptor(c) for c in crops])[1:]
+
+
 def video(weights, device):
     return limited(lambda clips: np.stack([descriptor(c) for c in clips]))
 

@@ -18,6 +18,8 @@ import torch
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../scripts"))
 import export_text_encoders as exporter  # noqa: E402
 
+# Phrases that PyTorch embeds together.
+BATCH = 25
 VERBS = ["wash", "toast", "cut", "cook", "open", "pour", "sweep", "read", "fold", "switch on", "peel", "feed"]
 THINGS = ["a kitchen utensil", "the bread", "vegetables", "food in the pan", "the fridge", "water into the glass",
           "the floor", "the newspaper", "a blanket", "the television", "an orange", "the dog"]
@@ -53,14 +55,14 @@ def bert_vocabulary(path):
     open(path, "w", encoding="utf-8").write("\n".join(listed) + "\n")
 
 
-def expect(module, out, tokens, masks):
+def expect(module, out, inputs):
+    """Writes phrases, their tokens (the first of the inputs, [phrases, context]) and PyTorch's embeddings."""
     found = []
     with torch.no_grad():
-        for row, mask in zip(tokens, masks):
-            ids = torch.tensor([row])
-            found.append((module(ids) if len(module.inputs) == 1 else module(ids, torch.tensor([mask]))).numpy()[0])
-    np.save(f"{out}/expected.npy", np.stack(found).astype(np.float32))
-    json.dump(dict(phrases=phrases(), tokens=tokens), open(f"{out}/expected.json", "w"))
+        for n in range(0, len(phrases()), BATCH):
+            found.append(module(*(torch.tensor(i[n:n + BATCH]) for i in inputs)).numpy())
+    np.save(f"{out}/expected.npy", np.concatenate(found).astype(np.float32))
+    json.dump(dict(phrases=phrases(), tokens=inputs[0]), open(f"{out}/expected.json", "w"))
 
 
 def clip(out):
@@ -70,7 +72,7 @@ def clip(out):
     module = exporter.load_clip("ViT-B-16", None)
     exporter.export(module, exporter.clip_tokenizer(bpe), out, "clip", "random ViT-B-16", bpe.context_length, 0)
     tokens = [bpe(p)[0].tolist() for p in phrases()]
-    expect(module, out, tokens, [None] * len(tokens))
+    expect(module, out, [tokens])
 
 
 def egovideo(out):
@@ -90,7 +92,7 @@ def egovideo(out):
         ids = [own.cls_token_id] + ids + [own.sep_token_id]
         masks.append([1] * len(ids) + [0] * (20 - len(ids)))
         tokens.append(ids + [own.pad_token_id] * (20 - len(ids)))
-    expect(module, out, tokens, masks)
+    expect(module, out, [tokens, masks])
 
 
 if __name__ == "__main__":

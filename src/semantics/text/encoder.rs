@@ -6,27 +6,11 @@
 use std::path::{Path, PathBuf};
 
 use rten::{Model, NodeId, Value};
-use serde::{Deserialize, Serialize};
 use tokenizers::Tokenizer;
 
 use super::TextError;
+use super::folder::{EXPORT_AGAIN, EncoderFile};
 use crate::scene::features::{Space, normalise};
-
-/// `encoder.json`.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct EncoderFile {
-    /// The space of the embeddings.
-    pub space: Space,
-    /// Name of the model, for people.
-    pub model: String,
-    /// Tokens that the model takes: longer texts are cut, shorter ones padded.
-    pub context: usize,
-    /// The token to pad with.
-    pub pad: u32,
-    /// Numbers per embedding.
-    pub dim: usize,
-}
 
 /// A text tower and its tokenizer.
 pub struct TextEncoder {
@@ -39,9 +23,6 @@ pub struct TextEncoder {
     output: NodeId,
 }
 
-/// A model takes no more tokens than this; it guards against a damaged `encoder.json`.
-const MAX_CONTEXT: usize = 4096;
-
 impl TextEncoder {
     /// Loads the encoder in a folder.
     ///
@@ -51,15 +32,9 @@ impl TextEncoder {
         let bad = |name: &str, what: String| TextError::Encoder {
             path: folder.join(name),
             what,
-            remedy: "export the encoder again with scripts/export_text_encoders.py",
+            remedy: EXPORT_AGAIN,
         };
-        let text = std::fs::read(folder.join("encoder.json"))
-            .map_err(|e| bad("encoder.json", format!("cannot be read: {e}")))?;
-        let about: EncoderFile =
-            serde_json::from_slice(&text).map_err(|e| bad("encoder.json", e.to_string()))?;
-        if !(2..=MAX_CONTEXT).contains(&about.context) || about.dim == 0 {
-            return Err(bad("encoder.json", format!("a context of {} tokens", about.context)));
-        }
+        let about = EncoderFile::read(folder)?;
         let tokenizer = Tokenizer::from_file(folder.join("tokenizer.json"))
             .map_err(|e| bad("tokenizer.json", e.to_string()))?;
         let model =
@@ -70,11 +45,6 @@ impl TextEncoder {
         let output =
             node("embedding").ok_or_else(|| bad("model.onnx", "it has no output `embedding`".into()))?;
         Ok(Self { folder: folder.to_owned(), about, tokenizer, model, ids, mask, output })
-    }
-
-    /// Where it was loaded from.
-    pub fn folder(&self) -> &Path {
-        &self.folder
     }
 
     /// The space of its embeddings.
@@ -137,10 +107,12 @@ impl TextEncoder {
     }
 
     fn failed(&self, what: String) -> TextError {
-        TextError::Encoder {
-            path: self.folder.clone(),
-            what,
-            remedy: "export the encoder again with scripts/export_text_encoders.py",
-        }
+        TextError::Encoder { path: self.folder.clone(), what, remedy: EXPORT_AGAIN }
+    }
+}
+
+impl std::fmt::Debug for TextEncoder {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("TextEncoder").field("folder", &self.folder).field("about", &self.about).finish()
     }
 }
