@@ -22,7 +22,7 @@ pub struct StreamConfig {
     pub code: usize,
     /// Knots of the frame code over the video; 0: one for every training frame.
     pub knots: usize,
-    /// Lattices over two axes of space and time, for each pair of axes (dynamic) or for the image (actor); 0: none.
+    /// Lattices over space and time (dynamic, actor).
     pub time_levels: usize,
     /// Cells along the longest side of the box at the finest of them; along time it has one cell for two frames.
     pub time_finest: f32,
@@ -68,7 +68,7 @@ impl Default for FieldConfig {
             code: 16,
             knots: 16,
             time_levels: 2,
-            time_finest: 96.0,
+            time_finest: 64.0,
             density_bias: -5.0,
             ..persistent.clone()
         };

@@ -27,14 +27,14 @@ pub type Points = [[f32; TILE]; AXES];
 /// The lattice of one level.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Level {
-    /// The three axes that it spans.
-    pub axes: [usize; 3],
-    /// Cells per unit length along each of them.
+    /// Cells per unit length.
     pub scale: Vec3,
+    /// Cells over the whole of time; 0 for a lattice of space alone.
+    pub time_scale: f32,
     /// Largest cell index along each axis.
-    last_cell: [u32; 3],
+    last_cell: [u32; AXES],
     /// Row strides of a dense level; the multipliers of a hashed one.
-    stride: [u32; 3],
+    stride: [u32; AXES],
     /// Rows in the table.
     pub rows: usize,
     /// Whether lattice points map to rows one to one.
@@ -64,34 +64,29 @@ impl HashGrid {
         let levels = (0..levels)
             .map(|n| {
                 let scale = coarsest * (finest / coarsest).powf(growth(n));
-                Level::new([0, 1, 2], extent, scale, 1usize << log2_rows)
+                Level::new(extent, scale, 0.0, 1usize << log2_rows)
             })
             .collect();
         Self { levels }
     }
 
-    /// Adds `levels` lattices over each of `planes` (two axes of space) and time, from `coarsest` to `finest` cells per
-    /// unit of space and time.
+    /// Adds `levels` lattices over space and time, from `coarsest` to `finest` cells per unit of space and of time.
     ///
-    /// Space alone can only be modulated by a frame's code; here things can move (Cao and Johnson 2023, HexPlane).
+    /// A frame's code can only modulate what space alone tells; here things can be at one place now and at another
+    /// one then.
     pub fn with_time(
         mut self,
         extent: Vec3,
-        planes: &[[usize; 2]],
         levels: usize,
         coarsest: [f32; 2],
         finest: [f32; 2],
         log2_rows: u32,
     ) -> Self {
-        for n in 0..levels {
+        self.levels.extend((0..levels).map(|n| {
             let growth = if levels > 1 { n as f32 / (levels - 1) as f32 } else { 1.0 };
             let [space, time] = std::array::from_fn(|k| coarsest[k] * (finest[k] / coarsest[k]).powf(growth));
-            for &[a, b] in planes {
-                let size = Vec3::new(extent[a], extent[b], 1.0);
-                let scale = Vec3::new(space, space, time);
-                self.levels.push(Level::new([a, b, TIME], size, scale, 1usize << log2_rows));
-            }
-        }
+            Level::new(extent, Vec3::splat(space), time, 1usize << log2_rows)
+        }));
         self
     }
 
@@ -102,52 +97,79 @@ impl HashGrid {
 }
 
 impl Level {
-    /// `extent` is along `axes`.
-    fn new(axes: [usize; 3], extent: Vec3, scale: Vec3, max_rows: usize) -> Self {
+    fn new(extent: Vec3, scale: Vec3, time_scale: f32, max_rows: usize) -> Self {
         let cells = (extent * scale).ceil().max(Vec3::ONE).as_uvec3();
-        let points = [cells.x + 1, cells.y + 1, cells.z + 1];
+        let time_cells = time_scale.ceil() as u32;
+        let points = [cells.x + 1, cells.y + 1, cells.z + 1, time_cells + 1];
         let lattice = points.iter().map(|&p| p as usize).product::<usize>();
         let dense = lattice <= max_rows;
         let (stride, rows) = if dense {
-            ([1, points[0], points[0] * points[1]], lattice)
+            ([1, points[0], points[0] * points[1], points[0] * points[1] * points[2]], lattice)
         } else {
-            // Instant-ngp's primes; 1 for x keeps neighbours in x on one cache line.
-            ([1, 2_654_435_761, 805_459_861], max_rows)
+            // Instant-ngp's primes and one more; 1 for x keeps neighbours in x on one cache line.
+            ([1, 2_654_435_761, 805_459_861, 3_674_653_429], max_rows)
         };
-        Self { axes, scale, last_cell: [cells.x - 1, cells.y - 1, cells.z - 1], stride, rows, dense }
+        let last_cell = [cells.x - 1, cells.y - 1, cells.z - 1, time_cells.saturating_sub(1)];
+        Self { scale, time_scale, last_cell, stride, rows, dense }
     }
 
     /// Writes the features of one tile of points to `out`, a row a point.
     #[inline(always)]
     pub fn encode(&self, table: &[Row], pos: &Points, out: &mut [Row]) {
-        let corners = self.corners(pos);
+        let (corners, after) = self.around(pos);
         for (s, out) in out.iter_mut().enumerate() {
             *out = corners.interpolate(table, s).0;
+        }
+        if let Some((corners, fraction)) = after {
+            for (s, out) in out.iter_mut().enumerate() {
+                *out += (corners.interpolate(table, s).0 - *out) * fraction[s];
+            }
         }
     }
 
     /// As [`Self::encode`], and each point's derivatives of its features by x, y and z.
     #[inline(always)]
     pub fn encode_with_slopes(&self, table: &[Row], pos: &Points, out: &mut [Row], slopes: &mut [[Row; 3]]) {
-        let corners = self.corners(pos);
+        let (corners, after) = self.around(pos);
         for (s, (out, slopes)) in out.iter_mut().zip(slopes).enumerate() {
-            let (value, by) = corners.interpolate(table, s);
-            *out = value;
-            *slopes = [Row::ZERO; 3];
-            for k in (0..3).filter(|&k| self.axes[k] != TIME) {
-                slopes[self.axes[k]] = by[k] * self.scale[k];
+            let (mut value, mut by) = corners.interpolate(table, s);
+            if let Some((corners, fraction)) = &after {
+                let (then, by_then) = corners.interpolate(table, s);
+                value += (then - value) * fraction[s];
+                (0..3).for_each(|k| by[k] += (by_then[k] - by[k]) * fraction[s]);
             }
+            *out = value;
+            *slopes = std::array::from_fn(|k| by[k] * self.scale[k]);
         }
     }
 
+    /// The corners around each point; for a lattice with time those before it, and those after it with the share of the
+    /// latter.
     #[inline(always)]
-    fn corners(&self, pos: &Points) -> Corners {
+    fn around(&self, pos: &Points) -> (Corners, Option<(Corners, [f32; TILE])>) {
+        if self.time_scale == 0.0 {
+            return (self.corners(pos, &[0; TILE]), None);
+        }
+        let (mut before, mut after, mut fraction) = ([0; TILE], [0; TILE], [0.0; TILE]);
+        for s in 0..TILE {
+            let q = pos[TIME][s] * self.time_scale;
+            let (index, cell) = floor_within(q, self.last_cell[TIME] as f32);
+            before[s] = index.wrapping_mul(self.stride[TIME]);
+            after[s] = (index + 1).wrapping_mul(self.stride[TIME]);
+            fraction[s] = (q - cell).clamp(0.0, 1.0);
+        }
+        (self.corners(pos, &before), Some((self.corners(pos, &after), fraction)))
+    }
+
+    /// The corners in space around each point, in the layer of time that begins at `layer` (times its stride).
+    #[inline(always)]
+    fn corners(&self, pos: &Points, layer: &[u32; TILE]) -> Corners {
         let mut cell = [[0u32; TILE]; 3];
         let mut frac = [[0.0f32; TILE]; 3];
         for axis in 0..3 {
             let (scale, last) = (self.scale[axis], self.last_cell[axis] as f32);
             for s in 0..TILE {
-                let q = pos[self.axes[axis]][s] * scale;
+                let q = pos[axis][s] * scale;
                 // A point outside the box (or NaN) lands in the nearest cell (or the first).
                 let (index, c) = floor_within(q, last);
                 cell[axis][s] = index;
@@ -162,7 +184,12 @@ impl Level {
                 let x = cell[0][s] + dx;
                 let y = (cell[1][s] + dy).wrapping_mul(stride[1]);
                 let z = (cell[2][s] + dz).wrapping_mul(stride[2]);
-                rows[s] = if self.dense { x.wrapping_add(y).wrapping_add(z) } else { (x ^ y ^ z) & mask };
+                let t = layer[s];
+                rows[s] = if self.dense {
+                    x.wrapping_add(y).wrapping_add(z).wrapping_add(t)
+                } else {
+                    (x ^ y ^ z ^ t) & mask
+                };
             }
         }
         Corners { rows, frac }
@@ -172,20 +199,32 @@ impl Level {
     /// they were read.
     #[inline(always)]
     pub fn scatter(&self, grads: &mut [Row], pos: &Points, g: &[Row]) {
-        let c = self.corners(pos);
-        for (s, g) in g.iter().enumerate() {
-            let (fx, fy, fz) = (c.frac[0][s], c.frac[1][s], c.frac[2][s]);
-            let (g1, g0) = (*g * fz, *g * (1.0 - fz));
-            let (g11, g10, g01, g00) = (g1 * fy, g0 * fy, g1 * (1.0 - fy), g0 * (1.0 - fy));
-            for (n, g) in [g00, g10, g01, g11].into_iter().enumerate() {
-                grads[c.rows[2 * n][s] as usize] += g * (1.0 - fx);
-                grads[c.rows[2 * n + 1][s] as usize] += g * fx;
+        match self.around(pos) {
+            (corners, None) => corners.scatter(grads, g, |_| 1.0),
+            (before, Some((after, fraction))) => {
+                before.scatter(grads, g, |s| 1.0 - fraction[s]);
+                after.scatter(grads, g, |s| fraction[s]);
             }
         }
     }
 }
 
 impl Corners {
+    /// Adds `g`, times `share` of its lane, to the rows by the weights with which they are read.
+    #[inline(always)]
+    fn scatter(&self, grads: &mut [Row], g: &[Row], share: impl Fn(usize) -> f32) {
+        for (s, g) in g.iter().enumerate() {
+            let g = *g * share(s);
+            let (fx, fy, fz) = (self.frac[0][s], self.frac[1][s], self.frac[2][s]);
+            let (g1, g0) = (g * fz, g * (1.0 - fz));
+            let (g11, g10, g01, g00) = (g1 * fy, g0 * fy, g1 * (1.0 - fy), g0 * (1.0 - fy));
+            for (n, g) in [g00, g10, g01, g11].into_iter().enumerate() {
+                grads[self.rows[2 * n][s] as usize] += g * (1.0 - fx);
+                grads[self.rows[2 * n + 1][s] as usize] += g * fx;
+            }
+        }
+    }
+
     /// Features of lane `s`, and their derivatives by its three fractions.
     #[inline(always)]
     fn interpolate(&self, table: &[Row], s: usize) -> (Row, [Row; 3]) {

@@ -114,12 +114,11 @@ impl FieldShape {
         let c = self.config.stream(stream);
         let actor = stream == Stream::Actor;
         let extent = if actor { Vec3::ONE } else { self.normalisation.extent };
-        let planes: &[[usize; 2]] = if actor { &[[0, 1]] } else { &[[0, 1], [0, 2], [1, 2]] };
         // A lattice point between two training frames that are farther apart than a cell would never be trained.
         let frames = (0.5 * self.times.len() as f32).max(1.0);
         let (coarsest, finest) = ([c.coarsest, 0.25 * frames], [c.time_finest, frames]);
         HashGrid::new(extent, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows)
-            .with_time(extent, planes, c.time_levels, coarsest, finest, c.log2_rows)
+            .with_time(extent, c.time_levels, coarsest, finest, c.log2_rows)
     }
 }
 

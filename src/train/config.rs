@@ -72,7 +72,7 @@ pub struct TrainConfig {
 impl Default for TrainConfig {
     fn default() -> Self {
         Self {
-            steps: 4500,
+            steps: 3600,
             rays: 4096,
             patch: 4,
             samples: 20,

@@ -42,11 +42,11 @@ impl Default for LossConfig {
         Self {
             beta_min: 0.03,
             transient: 0.01,
-            transient_opacity: [8.0, 6.0],
+            transient_opacity: [8.0, 4.0],
             distortion: 0.3,
             entropy: 0.0,
             depth: 4.0,
-            flatness: 1.0,
+            flatness: 2.0,
             exposure: 0.1,
         }
     }
@@ -175,7 +175,7 @@ pub fn backward(
             let d = grad.disparity[r] / ray.ray.refined_cam.z;
             for k in range.clone() {
                 for g in &mut grad.weight[k] {
-                    *g += d / chunk.intervals[k].t;
+                    *g += d * flatness::inverse(chunk.intervals[k].t);
                 }
             }
         }

@@ -117,7 +117,7 @@ pub fn config() -> Config {
     small(&mut config.field.actor, 3, 0);
     config.field.actor_reach = 0.4;
     config.train.rays = 512;
-    config.train.patch = 4;
+    config.train.patch = 2;
     config.train.samples = 10;
     config.train.grid_cells = 16.0;
     config

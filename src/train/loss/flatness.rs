@@ -89,11 +89,71 @@ pub fn backward(
 /// Expected inverse z-depth of ray `r`, 1/units; what passes the box is at infinity.
 pub fn disparity(chunk: &Chunk, r: usize, count: usize) -> f32 {
     let range = r * count..(r + 1) * count;
-    let sum = chunk.intervals[range.clone()].iter().zip(&chunk.weighted[range]).map(|(i, w)| w.total() / i.t);
+    let sum = chunk.intervals[range.clone()]
+        .iter()
+        .zip(&chunk.weighted[range])
+        .map(|(i, w)| w.total() * inverse(i.t));
     sum.sum::<f32>() / chunk.rays[r].ray.refined_cam.z
+}
+
+/// 1/t, bounded: a ray that misses the box has its samples at 0.
+pub fn inverse(t: f32) -> f32 {
+    1.0 / t.max(1e-6)
 }
 
 /// What a bend is measured by: the mean disparity of its rays.
 pub fn level(disparities: [f32; 3]) -> f32 {
     disparities.iter().sum::<f32>() / 3.0 + 1e-3
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{Vec2, Vec3};
+
+    use super::*;
+
+    /// A patch of `side`² rays, `step` apart in the image, all of one colour.
+    fn patch(side: usize, step: f32) -> (Vec<RayInput>, Vec<RayTarget>) {
+        let ray = |k: usize| RayInput {
+            view: 0,
+            dir_cam: Vec3::Z,
+            uv: Vec2::new(0.3 + step * (k % side) as f32, 0.4 + step * (k / side) as f32),
+            jitter: 0.5,
+        };
+        let target = RayTarget { rgb: [0.5; 3], background: [0.0; 3], exposure: [0.0; 6], depth: 0.0 };
+        ((0..side * side).map(ray).collect(), vec![target; side * side])
+    }
+
+    fn bends(rays: &[RayInput], targets: &[RayTarget], side: usize) -> Vec<Bend> {
+        let mut out = Vec::new();
+        find(rays, targets, side, &mut out);
+        out
+    }
+
+    #[test]
+    fn every_row_and_column_of_three_is_found() {
+        let (rays, targets) = patch(4, 0.01);
+        let found = bends(&rays, &targets, 4);
+        assert_eq!(found.len(), 16);
+        assert!(found.iter().all(|b| b.weight == 1.0));
+        assert!(found.iter().any(|b| b.rays == [1, 5, 9]) && found.iter().any(|b| b.rays == [13, 14, 15]));
+        for side in [1, 2] {
+            let (rays, targets) = patch(side, 0.01);
+            assert_eq!(bends(&rays, &targets, side), []);
+        }
+    }
+
+    #[test]
+    fn pixels_that_were_moved_are_no_row_and_contrast_takes_weight() {
+        let (mut rays, mut targets) = patch(3, 0.01);
+        rays[4].uv = rays[0].uv;
+        targets[0].rgb[1] += CONTRAST;
+        let found = bends(&rays, &targets, 3);
+        let rows: Vec<_> = found.iter().map(|b| b.rays).collect();
+        assert_eq!(rows, [[0, 1, 2], [0, 3, 6], [6, 7, 8], [2, 5, 8]]);
+        let e = (-1.0f32).exp();
+        for (b, weight) in found.iter().zip([e, e, 1.0, 1.0]) {
+            assert!((b.weight - weight).abs() < 1e-5, "{b:?}");
+        }
+    }
 }

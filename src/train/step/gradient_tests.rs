@@ -48,6 +48,15 @@ fn trace(seed: u64) -> Traced {
     trace_with(seed, Precision::F32)
 }
 
+/// Seeds whose chunk looks at every frame.
+fn seeds() -> impl Iterator<Item = u64> {
+    let sees_all = |seed: &u64| {
+        let traced = trace(*seed);
+        (0..traced.pixels.frames.len() as u32).all(|n| traced.chunk.inputs.iter().any(|i| i.view == n))
+    };
+    (1..).filter(sees_all)
+}
+
 fn trace_with(seed: u64, precision: Precision) -> Traced {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let mut pixels = PixelSet::load(testing::frames(folder.path())).expect("frames that were just written");
@@ -82,6 +91,8 @@ fn trace_with(seed: u64, precision: Precision) -> Traced {
     // Every fourth chunk refines poses: the first one does at a step that is a multiple of four.
     let mut plan = config.train.plan(4, 0.5, [true; 3]);
     plan.precision = precision;
+    // Patches that have rows of three, and as many of them as fit into a chunk.
+    plan.patch = 3;
     plan.pose_rate = 1.0;
     plan.rig_rate = 1.0;
     // Large enough that one per cent of a term is more than the tolerance.
@@ -287,7 +298,7 @@ fn check(traced: &Traced, seed: u64) {
 
 #[test]
 fn every_gradient_matches_finite_differences() {
-    for seed in [1, 2, 3] {
+    for seed in seeds().take(3) {
         let traced = trace(seed);
         let [p, d, a] = traced.chunk.traced.batches.each_ref().map(|b| b.len());
         let placed = traced.chunk.traced.intervals.len();
@@ -329,7 +340,7 @@ fn a_group_without_gradient_is_found() {
 /// Each term of the loss, weighted 1 % differently in the reference, must make some group disagree.
 #[test]
 fn a_term_that_is_off_by_one_per_cent_is_found() {
-    let traced = trace(1);
+    let traced = trace(seeds().next().expect("there is one"));
     let wrong: [fn(&mut LossConfig); 9] = [
         |c| c.beta_min *= 1.01,
         |c| c.transient *= 1.01,
@@ -370,7 +381,7 @@ fn a_term_that_is_off_by_one_per_cent_is_found() {
 /// which are sums over a whole picture whose terms mostly cancel.
 #[test]
 fn bf16_gradients_agree_with_f32_ones() {
-    for seed in [1, 2, 3] {
+    for seed in seeds().take(3) {
         let (exact, rounded) = (trace(seed), trace_with(seed, Precision::Bf16));
         assert!((exact.loss - rounded.loss).abs() < 1e-2 * exact.loss.abs());
         for (name, place, range) in exact.groups() {
@@ -379,7 +390,7 @@ fn bf16_gradients_agree_with_f32_ones() {
             let size = norm(&mut a.iter().copied());
             let error = norm(&mut a.iter().zip(b).map(|(a, b)| a - b));
             let camera = range.start >= exact.field.layout.exposure.start;
-            let bound = if matches!(place, Place::Weights) && camera { 0.5 } else { 0.15 };
+            let bound = if matches!(place, Place::Weights) && camera { 0.7 } else { 0.15 };
             assert!(error < bound * size, "seed {seed}, {name}: off by {error:e} of {size:e}");
         }
     }

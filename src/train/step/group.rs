@@ -20,8 +20,9 @@ const REFRESH_CELLS: usize = 2 * TILE;
 /// How fast the density grids follow those looks.
 const REFRESH_RATE: f32 = 0.3;
 
-/// Pixels of a patch are 1, 2, 4 ... (this many powers of two) apart.
-const PATCH_STRIDES: usize = 4;
+/// Pixels of a patch are 1, 2, 4 ... (this many powers of two) apart: near ones share cells of the lattices, far ones
+/// tell whether a surface as large as a door is flat.
+const PATCH_STRIDES: usize = 6;
 
 /// What all groups read.
 pub struct Context<'a> {
@@ -133,14 +134,19 @@ impl TrainChunk {
                 corner = loop {
                     let frame = rng.below(pixels.frames.len());
                     if let Some(pixel) = pixels.pick(frame, rng.uniform()) {
-                        break (frame, pixel, 1 << rng.below(PATCH_STRIDES));
+                        break (frame, pixel, 1u32 << rng.below(PATCH_STRIDES));
                     }
                 };
             }
             let (frame, first, stride) = corner;
             let camera = &pixels.frames[frame].camera;
-            let x = (first as u32 % camera.width + in_patch % side * stride).min(camera.width - 1);
-            let y = (first as u32 / camera.width + in_patch / side * stride).min(camera.height - 1);
+            // A patch that sticks out is moved back into the picture, as far as it fits.
+            let along = |first: u32, size: u32, n: u32| {
+                let start = first.min(size.saturating_sub((side - 1) * stride + 1));
+                (start + n * stride).min(size - 1)
+            };
+            let x = along(first as u32 % camera.width, camera.width, in_patch % side);
+            let y = along(first as u32 / camera.width, camera.height, in_patch / side);
             let pixel = match pixels.is_usable(frame, x + y * camera.width) {
                 true => (x + y * camera.width) as usize,
                 false => first,

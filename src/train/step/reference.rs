@@ -116,7 +116,7 @@ impl Reference<'_> {
                 let wrong = (((t - depth).abs() / depth - free) / (whole - free)).clamp(0.0, 1.0);
                 price += f64::from(c.depth) * wrong * total;
             }
-            *disparity += total / (t * f64::from(self.chunk.rays[r].ray.refined_cam.z));
+            *disparity += total / (t.max(1e-6) * f64::from(self.chunk.rays[r].ray.refined_cam.z));
             entropy += light * alpha * (1.0 - alpha);
             weights.push((total, f64::from(i.t), delta));
             light *= 1.0 - alpha;
@@ -219,29 +219,31 @@ impl Reference<'_> {
 
 /// Trilinear interpolation of one level's rows.
 fn interpolate(level: &Level, table: &[f64], p: [f64; AXES], extent: [f64; AXES]) -> [f64; FEATURES] {
-    let mut cell = [0u64; 3];
-    let mut frac = [0.0; 3];
-    let mut points = [0u64; 3];
-    for axis in 0..3 {
-        let along = level.axes[axis];
+    let scale = [level.scale.x, level.scale.y, level.scale.z, level.time_scale];
+    let (mut cell, mut frac, mut points) = ([0u64; AXES], [0.0; AXES], [1u64; AXES]);
+    for axis in (0..AXES).filter(|&a| scale[a] > 0.0) {
         // The lattice is laid out in f32.
-        let cells = (extent[along] as f32 * level.scale[axis]).ceil().max(1.0) as u64;
-        let q = p[along] * f64::from(level.scale[axis]);
+        let cells = (extent[axis] as f32 * scale[axis]).ceil().max(1.0) as u64;
+        let q = p[axis] * f64::from(scale[axis]);
         cell[axis] = (q.floor().max(0.0) as u64).min(cells - 1);
         frac[axis] = (q - cell[axis] as f64).clamp(0.0, 1.0);
         points[axis] = cells + 1;
     }
     let mut out = [0.0; FEATURES];
-    for corner in 0..8u64 {
-        let step = [corner & 1, corner >> 1 & 1, corner >> 2];
-        let at = [cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]];
+    for corner in 0..16u64 {
+        let step: [u64; AXES] = std::array::from_fn(|a| corner >> a & 1);
+        let at: [u64; AXES] = std::array::from_fn(|a| cell[a] + step[a]);
         let row = if level.dense {
-            at[0] + points[0] * (at[1] + points[1] * at[2])
+            at[0] + points[0] * (at[1] + points[1] * (at[2] + points[2] * at[3]))
         } else {
-            // Instant-ngp's hash, modulo a power of two.
-            (at[0] ^ (at[1] * 2_654_435_761) ^ (at[2] * 805_459_861)) % level.rows as u64
+            // Instant-ngp's hash with a prime for time, modulo a power of two.
+            let hash = at[0] ^ (at[1] * 2_654_435_761) ^ (at[2] * 805_459_861) ^ (at[3] * 3_674_653_429);
+            hash % level.rows as u64
         };
-        let weight: f64 = (0..3).map(|a| if step[a] == 1 { frac[a] } else { 1.0 - frac[a] }).product();
+        let weight: f64 = (0..AXES).map(|a| if step[a] == 1 { frac[a] } else { 1.0 - frac[a] }).product();
+        if weight == 0.0 {
+            continue;
+        }
         for (o, v) in out.iter_mut().zip(&table[row as usize * FEATURES..]) {
             *o += weight * v;
         }
