@@ -98,7 +98,7 @@ fn truncated_models_are_errors_that_name_the_file() {
     let model = std::fs::read(from.join("model.onnx")).unwrap();
     for length in [0, 1, 100, 10_000, 1 << 20, model.len() / 2, model.len() - 1] {
         std::fs::write(folder.path().join("model.onnx"), &model[..length]).unwrap();
-        let error = TextEncoder::open(folder.path()).err().expect("a truncated model was opened").to_string();
+        let error = TextEncoder::open(folder.path()).expect_err("a truncated model was opened").to_string();
         assert!(error.contains("model.onnx") && error.contains("export the encoder again"), "{error}");
     }
 }
@@ -106,7 +106,7 @@ fn truncated_models_are_errors_that_name_the_file() {
 #[test]
 fn damaged_encoders_are_errors_that_name_the_file() {
     let folder = tempfile::tempdir().unwrap();
-    let error = || TextEncoder::open(folder.path()).err().expect("a broken encoder was opened").to_string();
+    let error = || TextEncoder::open(folder.path()).expect_err("a broken encoder was opened").to_string();
     assert!(error().contains("encoder.json"));
     let about = r#"{"space": "clip", "model": "x", "context": 77, "pad": 0, "dim": 4}"#;
     std::fs::write(folder.path().join("encoder.json"), about.replace("77", "1")).unwrap();
