@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::field::FieldConfig;
 use crate::map::MapConfig;
+use crate::semantics::SemanticsConfig;
 use crate::stereo::StereoConfig;
 use crate::train::TrainConfig;
 use crate::train::loss::LossConfig;
@@ -39,6 +40,8 @@ pub struct Config {
     pub stereo: StereoConfig,
     /// The field.
     pub field: FieldConfig,
+    /// The fields of features.
+    pub semantics: SemanticsConfig,
     /// What is extracted from it.
     pub map: MapConfig,
 }
@@ -143,6 +146,8 @@ impl Config {
             let remedy = "levels 1-16, log2_rows 1-24, 1 <= coarsest <= finest <= 65536, hidden 4-512, layers 1-8, code <= 64";
             range(key, format!("{c:?}"), ok, remedy)?;
         }
+        let semantics = self.semantics.check();
+        semantics.map_err(|(key, value, remedy)| ConfigError::Range { key, value, remedy })?;
         self.map.validate()
     }
 }

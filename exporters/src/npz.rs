@@ -7,8 +7,8 @@
 mod read;
 mod write;
 
-pub use read::read_npz;
-pub use write::{NpzCompression, write_npz};
+pub use read::{Matrix, read_npz, read_npz_matrices};
+pub use write::{NpzCompression, write_npz, write_npz_matrices};
 
 #[cfg(test)]
 mod tests;

@@ -44,6 +44,10 @@ pub enum Command {
     #[command(after_help = "Example:\n  divff render runs/kitchen --split test --layers rgb,depth,stream \
         --out views")]
     Render(RenderArgs),
+    /// Find a phrase in a map: scores at all vertices, and a picture
+    #[command(after_help = "Example:\n  divff query runs/kitchen --text mug --text kettle --out mug\n  \
+        divff query map/persistent.ply --text mug --scene kitchen --out mug")]
+    Query(QueryArgs),
     /// Measure a run against its scene's test frames and ground truth
     #[command(after_help = "Example:\n  divff eval runs/kitchen")]
     Eval(EvalArgs),
@@ -203,6 +207,41 @@ pub enum LayerArg {
     Normal,
     /// Opacity of each stream
     Stream,
+    /// Compressed image-language features
+    Clip,
+    /// Compressed video-language features
+    Egovideo,
+    /// Scores of the phrases asked for
+    Relevancy,
+}
+
+/// The two spaces of features.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SpaceArg {
+    /// Image-language: what things are
+    Clip,
+    /// Video-language: what can be done with them
+    Egovideo,
+}
+
+/// What is asked of the features.
+#[derive(Debug, Args)]
+pub struct TextArgs {
+    /// A phrase to look for, as often as needed
+    #[arg(long, value_name = "PHRASE")]
+    pub text: Vec<String>,
+    /// Space that phrases are looked for in
+    #[arg(long, value_enum, default_value = "clip")]
+    pub space: SpaceArg,
+    /// Embeddings of the phrases, one row for each --text in order, of shape [Q, D] or [D]
+    #[arg(long, value_name = "F.npy", requires = "text")]
+    pub text_embedding: Option<PathBuf>,
+    /// Text encoder for phrases without an embedding (scripts/export_text_encoders.py makes one)
+    #[arg(long, value_name = "DIR", requires = "text")]
+    pub text_encoder: Option<PathBuf>,
+    /// Temperature of the relevancy [default: that of the run]
+    #[arg(long, value_name = "TAU")]
+    pub temperature: Option<f32>,
 }
 
 /// `divff render`.
@@ -225,7 +264,24 @@ pub struct RenderArgs {
     /// Layers of the EXR files
     #[arg(long, value_enum, value_delimiter = ',', default_values = ["rgb", "depth", "stream"])]
     pub layers: Vec<LayerArg>,
+    #[command(flatten)]
+    pub text: TextArgs,
     /// Where the scene is, if it was moved
+    #[arg(long, value_name = "SCENE")]
+    pub scene: Option<PathBuf>,
+}
+
+/// `divff query`.
+#[derive(Debug, Args)]
+pub struct QueryArgs {
+    /// Folder of a run with a map, or a .ply or .glb file of a map
+    pub path: PathBuf,
+    #[command(flatten)]
+    pub text: TextArgs,
+    /// Folder for the scored map and the pictures
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Scene (or any folder with text/) whose embeddings are used [default: that of the run]
     #[arg(long, value_name = "SCENE")]
     pub scene: Option<PathBuf>,
 }
@@ -306,6 +362,6 @@ mod tests {
     #[test]
     fn what_does_not_exist_yet_is_not_offered() {
         let names: Vec<String> = Cli::command().get_subcommands().map(|c| c.get_name().to_owned()).collect();
-        assert_eq!(names, ["demo", "synth", "run", "train", "export", "render", "eval", "inspect"]);
+        assert_eq!(names, ["demo", "synth", "run", "train", "export", "render", "query", "eval", "inspect"]);
     }
 }

@@ -10,6 +10,7 @@ use divff::eval::EvalError;
 use divff::map::MapError;
 use divff::pipeline::PipelineError;
 use divff::scene::SceneError;
+use divff::semantics::SemanticsError;
 use divff::synth::SynthError;
 use divff::train::TrainError;
 
@@ -61,6 +62,12 @@ pub enum CliError {
 
 impl From<SceneError> for CliError {
     fn from(error: SceneError) -> Self {
+        Self::Pipeline(error.into())
+    }
+}
+
+impl From<SemanticsError> for CliError {
+    fn from(error: SemanticsError) -> Self {
         Self::Pipeline(error.into())
     }
 }
@@ -121,6 +128,16 @@ fn is_input(error: &PipelineError) -> bool {
         E::Map(error) => {
             matches!(**error, MapError::Scene(_) | MapError::Config(_) | MapError::NoSuchFrame { .. })
         }
+        E::Semantics(error) => matches!(
+            **error,
+            SemanticsError::Feature(_)
+                | SemanticsError::Scene(_)
+                | SemanticsError::Compress(_)
+                | SemanticsError::Relevancy(_)
+                | SemanticsError::Text(_)
+                | SemanticsError::NoFeatures { .. }
+                | SemanticsError::Stored { .. }
+        ),
         E::Eval(error) => !matches!(**error, EvalError::NonFinite { .. } | EvalError::Render { .. }),
         _ => false,
     }

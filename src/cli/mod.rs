@@ -6,6 +6,7 @@ mod error;
 mod inspect;
 mod output;
 mod progress;
+mod query;
 mod run;
 mod settings;
 mod stop;
@@ -49,6 +50,7 @@ fn dispatch(cli: Cli) -> Result<(), CliError> {
         Command::Train(args) => run::train(args, stop()?),
         Command::Export(args) => run::export(args, stop()?),
         Command::Render(args) => run::render(args, stop()?),
+        Command::Query(args) => query::query(args),
         Command::Eval(args) => run::eval(args, stop()?),
         Command::Inspect(args) => inspect::inspect(args),
     }

@@ -93,6 +93,7 @@ impl Observer for Reporter {
         match event {
             Event::Stage(stage) => self.start(match stage {
                 Stage::Training => "training",
+                Stage::Features => "features",
                 Stage::Mapping => "mapping",
                 Stage::Exporting => "exporting",
                 Stage::Rendering => "rendering",
@@ -106,6 +107,12 @@ impl Observer for Reporter {
                 self.note(&format!("already trained ({step} steps); --fresh starts over"));
             }
             Event::Training(progress) => self.training(progress),
+            Event::Features(p) => {
+                let inside = p.step as f64 / p.steps.max(1) as f64;
+                self.advance(0.5 * (p.space as usize as f64 + inside), || {
+                    format!("{}: step {}, loss {:.4}", p.space.name(), p.step, p.loss)
+                });
+            }
             Event::Mapping(p) => {
                 // Stages differ in length; each counts as one part of the bar.
                 let stages = [

@@ -15,6 +15,7 @@ use super::args::{EvalArgs, ExportArgs, FormatArg, LayerArg, RenderArgs, RunArgs
 use super::error::CliError;
 use super::output::say;
 use super::progress::{Reporter, human};
+use super::query;
 use super::settings;
 use super::stop::StopFlag;
 
@@ -42,9 +43,12 @@ pub fn train(args: &RunArgs, stop: StopFlag) -> Result<(), CliError> {
     let scene = open(&args.scene, &reporter)?;
     let run = RunFolder::new(&args.out);
     reporter.event(&Event::Stage(Stage::Training));
-    let progress = pipeline::train(&scene, &config, &run, args.fresh, &mut reporter)?.progress;
+    let trained = pipeline::train(&scene, &config, &run, args.fresh, &mut reporter)?;
+    let progress = trained.progress.clone();
+    let finished = progress.finished
+        && pipeline::train_features(&scene, &trained, &config, &run, &mut reporter)?.is_some();
     drop(reporter);
-    if !progress.finished {
+    if !finished {
         return Err(CliError::Stopped { step: progress.step });
     }
     say(format_args!("trained {} steps in {}", progress.step, human(progress.seconds)))
@@ -69,7 +73,11 @@ pub fn export(args: &ExportArgs, stop: StopFlag) -> Result<(), CliError> {
         false => Vec::new(),
     };
     let cost = &mut Cost::default();
-    let manifest = pipeline::export_map(&scene, &trained, &config, &args.out, &formats, cost, &mut reporter)?;
+    let fields = pipeline::features(&run, &trained)?;
+    let fields = fields.as_ref();
+    let out = &args.out;
+    let manifest =
+        pipeline::export_map(&scene, &trained, fields, &config, out, &formats, cost, &mut reporter)?;
     drop(reporter);
     let Some(mut manifest) = manifest else { return Err(CliError::Interrupted) };
     if !views.is_empty() {
@@ -96,7 +104,7 @@ fn export_views(
     let layers = [Layer::Rgb, Layer::Depth, Layer::Normal, Layer::Stream];
     reporter.event(&Event::Stage(Stage::Rendering));
     let folder = out.join("views");
-    let done = pipeline::render_views(trained, config, &frames, [true; 3], &layers, &folder, reporter)?;
+    let done = pipeline::render_views(trained, config, &frames, [true; 3], &layers, None, &folder, reporter)?;
     let names = |f: &&Frame| ["exr", "png"].map(|kind| format!("views/{}.{kind}", f.stem));
     Ok(frames[..done].iter().flat_map(names).collect())
 }
@@ -110,12 +118,16 @@ pub fn render(args: &RenderArgs, stop: StopFlag) -> Result<(), CliError> {
     create_writable(&args.out)?;
     let (trained, config) = (run.trained()?, run.config()?);
     let streams = chosen_streams(&args.streams);
-    let mut layers: Vec<Layer> = args.layers.iter().map(|l| layer(*l)).collect();
+    let mut layers: Vec<Layer> = args.layers.iter().filter_map(|l| layer(*l)).collect();
     layers.sort();
     layers.dedup();
+    let fields = pipeline::features(&run, &trained)?;
+    let features = query::feature_layers(args, &scene, &run, fields.as_ref(), &config)?;
+    let features = Some(&features).filter(|f| !f.is_empty());
     reporter.event(&Event::Stage(Stage::Rendering));
+    let out = &args.out;
     let done =
-        pipeline::render_views(&trained, &config, &frames, streams, &layers, &args.out, &mut reporter)?;
+        pipeline::render_views(&trained, &config, &frames, streams, &layers, features, out, &mut reporter)?;
     drop(reporter);
     if done < frames.len() {
         return Err(CliError::Interrupted);
@@ -136,7 +148,9 @@ pub fn eval(args: &EvalArgs, stop: StopFlag) -> Result<(), CliError> {
     let earlier = pipeline::metrics::read(&run.metrics_path());
     let cost = earlier.as_ref().map_or_else(Cost::default, |m| m.cost.clone());
     reporter.event(&Event::Stage(Stage::Evaluating));
-    let metrics = pipeline::evaluate(&scene, &trained, &config, &run, cost, &mut reporter)?;
+    let fields = pipeline::features(&run, &trained)?;
+    let fields = fields.as_ref();
+    let metrics = pipeline::evaluate(&scene, &trained, fields, &config, &run, cost, &mut reporter)?;
     drop(reporter);
     let Some(mut metrics) = metrics else { return Err(CliError::Interrupted) };
     for (key, value) in earlier.map(|m| m.skipped).unwrap_or_default() {
@@ -187,12 +201,14 @@ fn map_format(format: FormatArg) -> Option<Format> {
     }
 }
 
-fn layer(layer: LayerArg) -> Layer {
+/// `None` for what is not of the geometry but of the features.
+fn layer(layer: LayerArg) -> Option<Layer> {
     match layer {
-        LayerArg::Rgb => Layer::Rgb,
-        LayerArg::Depth => Layer::Depth,
-        LayerArg::Normal => Layer::Normal,
-        LayerArg::Stream => Layer::Stream,
+        LayerArg::Rgb => Some(Layer::Rgb),
+        LayerArg::Depth => Some(Layer::Depth),
+        LayerArg::Normal => Some(Layer::Normal),
+        LayerArg::Stream => Some(Layer::Stream),
+        LayerArg::Clip | LayerArg::Egovideo | LayerArg::Relevancy => None,
     }
 }
 
@@ -213,7 +229,12 @@ pub fn summary(metrics: &RunMetrics) -> String {
         q.depth_median_abs_m.map(|v| format!("depth off by {v:.3} (median)")),
         q.stream_miou.map(|v| format!("stream mIoU {v:.3}")),
     ];
+    let phrases = [
+        q.object_miou.map(|v| format!("objects mIoU {v:.3}")),
+        q.affordance_miou.map(|v| format!("affordances mIoU {v:.3}")),
+    ];
     line("pictures", &pictures);
+    line("phrases", &phrases);
     for (name, surface) in [("surface", &q.persistent), ("dynamic", &q.dynamic), ("actor", &q.actor)] {
         let surface = surface.as_ref();
         line(

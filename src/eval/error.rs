@@ -19,6 +19,14 @@ pub enum EvalError {
         /// The decoder's complaint.
         source: image::ImageError,
     },
+    /// A list of what phrases should find is not what it should be.
+    #[error("{}: is not {expected}; restore the file, or take it out of the scene", path.display())]
+    Labels {
+        /// The file.
+        path: PathBuf,
+        /// What it should be.
+        expected: &'static str,
+    },
     /// A ground-truth label image is not stored as it should be.
     #[error("{path}: is {got}; store the labels as 8-bit grey", path = path.display())]
     PixelType {

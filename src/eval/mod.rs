@@ -1,5 +1,4 @@
-//! How good a result is: every measure of `metrics.json` that needs a scene's ground truth, semantics
-//! aside.
+//! How good a result is: every measure of `metrics.json` that needs a scene's ground truth.
 //!
 //! [`evaluate()`] goes through the test frames and the meshes of a map; the parts stand by themselves:
 //! [`ImageSums`] (PSNR, depth, stream IoU), [`ssim()`], [`surface::compare`] (accuracy, completeness,
@@ -9,6 +8,7 @@
 mod error;
 mod evaluate;
 mod images;
+mod scores;
 mod ssim;
 pub mod surface;
 mod truth;
@@ -18,6 +18,7 @@ use std::collections::BTreeMap;
 pub use error::EvalError;
 pub use evaluate::{evaluate, evaluate_geometry, evaluate_images};
 pub use images::{ImageSums, RenderedView};
+pub use scores::{PhraseTruth, ScoreSums};
 use serde::{Deserialize, Serialize};
 pub use ssim::ssim;
 
@@ -52,6 +53,19 @@ pub struct Metrics {
     /// Mean of the stream IoUs that there are.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stream_miou: Option<f64>,
+    /// Mean IoU of the dynamic objects that move, found by their phrases (image-language, score above 0.5), over the
+    /// test frames where the truth covers 50 px or more.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub object_miou: Option<f64>,
+    /// Likewise of the affordances' regions (video-language).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub affordance_miou: Option<f64>,
+    /// Mean cosine between rendered image-language descriptors and the scene's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub feature_cosine_clip: Option<f64>,
+    /// Mean cosine between rendered video-language descriptors and the scene's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub feature_cosine_egovideo: Option<f64>,
     /// The persistent surface against `gt/mesh/persistent.ply`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub persistent: Option<surface::SurfaceMetrics>,

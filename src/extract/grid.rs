@@ -151,6 +151,30 @@ impl SparseGrid {
         Ok(Self { spec: *spec, values: vec![f32::NAN; blocks.len() * POINTS], blocks, report })
     }
 
+    /// This grid, with `value` of what `other` (of the same `spec`) knows where this one knows nothing.
+    ///
+    /// # Errors
+    /// `TooLarge` where the union does not fit.
+    pub fn or(&self, other: &Self, value: impl Fn(f32) -> f32 + Sync) -> Result<Self, ExtractError> {
+        let coords = self.blocks.coords().iter().chain(other.blocks.coords()).copied().collect();
+        let mut union = Self::unknown(&self.spec, BlockSet::new(self.spec.block_dims(), coords))?;
+        let blocks = &union.blocks;
+        union.values.par_chunks_mut(POINTS).enumerate().for_each(|(b, values)| {
+            let at = blocks.coords()[b].map(i64::from);
+            let of = |grid: &'_ Self| grid.blocks.find(at).map(|b| b * POINTS);
+            let (first, second) = (of(self), of(other));
+            for (k, out) in values.iter_mut().enumerate() {
+                let known = first.map_or(f32::NAN, |start| self.values[start + k]);
+                *out = match (known.is_nan(), second) {
+                    (true, Some(start)) => value(other.values[start + k]),
+                    _ => known,
+                };
+            }
+        });
+        union.blocks.share_borders(&mut union.values);
+        Ok(union)
+    }
+
     /// Where the grid lies.
     pub fn spec(&self) -> &GridSpec {
         &self.spec

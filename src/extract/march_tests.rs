@@ -28,6 +28,21 @@ fn sphere_has_its_area_volume_and_euler_characteristic() {
 }
 
 #[test]
+fn what_one_grid_does_not_know_another_one_fills_in() {
+    let sphere = |p: Vec3A| 0.4 - p.distance(CENTER);
+    let left = grid_where(40, 1.0, &|center, half| center.x - half < 0.45, sphere);
+    let whole = grid(40, 1.0, |p| 3.0 * sphere(p));
+    let filled = left.or(&whole, |v| v / 3.0).unwrap();
+    let mesh = march(&filled, 0.0).unwrap();
+    assert!(assert_manifold(&march(&left, 0.0).unwrap()) > 0, "half a sphere is open");
+    assert_closed(&mesh, 2);
+    close(mesh.signed_volume(), 4.0 / 3.0 * std::f64::consts::PI * 0.064, 3e-3);
+    // What is known stays, whatever the other grid says.
+    let other = grid(40, 1.0, |_| 1.0);
+    assert_eq!(whole.or(&other, |v| v).unwrap().value([20; 3]), whole.value([20; 3]));
+}
+
+#[test]
 fn torus_has_a_hole() {
     let torus = |p: Vec3A| {
         let q = p - CENTER;

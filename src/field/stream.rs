@@ -84,6 +84,30 @@ pub struct LevelRows {
     slopes: Vec<[Row; 3]>,
 }
 
+impl LevelRows {
+    /// Writes the features of tile `tile` to `out`, a row of lanes a feature, as networks read them.
+    #[inline(always)]
+    pub fn read_tile(&self, tile: usize, out: &mut [f32]) {
+        let rows = &self.rows[tile * TILE..][..TILE];
+        for lane in 0..TILE {
+            let row = rows[lane].to_array();
+            for k in 0..FEATURES {
+                out[k * TILE + lane] = row[k];
+            }
+        }
+    }
+
+    /// Replaces the features of tile `tile` by the gradient `g` with respect to them, in the order of
+    /// [`Self::read_tile`].
+    #[inline(always)]
+    pub fn write_tile(&mut self, tile: usize, g: &[f32]) {
+        let rows = &mut self.rows[tile * TILE..][..TILE];
+        for lane in 0..TILE {
+            rows[lane] = Row::new(g[lane], g[TILE + lane], g[2 * TILE + lane], g[3 * TILE + lane]);
+        }
+    }
+}
+
 /// The samples of a chunk at which one stream is evaluated, and their encoding.
 #[derive(Default)]
 pub struct StreamBatch {
@@ -312,13 +336,7 @@ impl StreamNet {
     ) {
         let (features, rest) = trunk.input(n).split_at_mut(self.grid.width() * TILE);
         for (level, out) in batch.levels.iter().zip(features.chunks_exact_mut(FEATURES * TILE)) {
-            let rows = &level.rows[tile * TILE..][..TILE];
-            for lane in 0..TILE {
-                let row = rows[lane].to_array();
-                for k in 0..FEATURES {
-                    out[k * TILE + lane] = row[k];
-                }
-            }
+            level.read_tile(tile, out);
         }
         condition(rest, self.code, batch.rays(tile), code);
         self.trunk.forward(simd, unit, w.trunk, trunk, n);
@@ -370,10 +388,7 @@ impl StreamNet {
             self.trunk.backward(simd, &unit, w.trunk, trunk, n);
             let (features, rest) = trunk.input_grad(n).split_at(self.grid.width() * TILE);
             for (level, g) in levels.iter_mut().zip(features.chunks_exact(FEATURES * TILE)) {
-                let rows = &mut level.rows[n * TILE..][..TILE];
-                for lane in 0..TILE {
-                    rows[lane] = Row::new(g[lane], g[TILE + lane], g[2 * TILE + lane], g[3 * TILE + lane]);
-                }
+                level.write_tile(n, g);
             }
             for (ray, run) in runs(rays) {
                 for (k, row) in rest.chunks_exact(TILE).take(self.code).enumerate() {

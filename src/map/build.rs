@@ -98,6 +98,8 @@ impl<'a> Builder<'a> {
             geometries: Vec::new(),
             objects: Vec::new(),
             points: Geometry { name: "points".into(), ..Geometry::default() },
+            features: Vec::new(),
+            affordances: Vec::new(),
             skipped: Vec::new(),
             up_axis,
             up_is_known,

@@ -14,8 +14,10 @@ use crate::field::Stream;
 pub enum SurfaceMethod {
     /// Rendered median depth of all training frames, fused into a signed distance and marched at 0.
     Tsdf,
-    /// The density on a grid, marched where a voxel's opacity is one half.
+    /// The same, and the density where no depth was fused.
     #[default]
+    Both,
+    /// The density on a grid, marched where a voxel's opacity is one half.
     Density,
 }
 
@@ -143,7 +145,7 @@ impl Default for MapConfig {
     fn default() -> Self {
         Self {
             voxel_size: None,
-            method: SurfaceMethod::Density,
+            method: SurfaceMethod::Both,
             times: Times::Auto,
             streams: Stream::ALL.to_vec(),
             points: 200_000,
@@ -151,7 +153,7 @@ impl Default for MapConfig {
             depth_samples: 32,
             min_views: 0.5,
             dynamic_views: 12,
-            truncation_voxels: 4.0,
+            truncation_voxels: 3.0,
             opaque_voxels: 2.0,
             min_component_voxels: 12.0,
             smoothing: 2,

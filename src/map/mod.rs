@@ -41,6 +41,10 @@ pub struct SemanticMap {
     pub points: Geometry,
     /// What was left out or shared, and why.
     pub skipped: Vec<Skipped>,
+    /// Features that the geometries have.
+    pub features: Vec<MapFeatures>,
+    /// Phrases of the columns `affordance_<slug>`: slug and phrase.
+    pub affordances: Vec<(String, String)>,
     /// Which world axis is up; see `up_is_known`.
     pub up_axis: UpAxis,
     /// Whether the cameras agree on an up axis that glTF can express; otherwise nothing is turned.
@@ -78,6 +82,19 @@ impl MapObject {
             Some(n) => format!("{}_{n:06}", self.stream.name()),
         }
     }
+}
+
+/// What a matrix of features is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MapFeatures {
+    /// As in the geometries: `clip_pca`.
+    pub name: String,
+    /// Numbers per vertex.
+    pub dim: usize,
+    /// Model that made the descriptors.
+    pub model: String,
+    /// Mean `[full]` and basis `[dim, full]` of the linear map that compressed them: x = mean + z · basis.
+    pub map: Option<(Vec<f32>, Vec<f32>)>,
 }
 
 /// Something that needed no work, or has no result.

@@ -27,13 +27,13 @@ pub(super) fn extract(b: &mut Builder, seen: &[SeenFrame]) -> Result<(), MapErro
     b.report(Stage::Persistent, 0, 1);
     let name = Stream::Persistent.name();
     let mut mesh = match b.cx.config.method {
-        SurfaceMethod::Tsdf => fused(&b.cx, seen)?,
+        SurfaceMethod::Tsdf | SurfaceMethod::Both => fused(&b.cx, seen)?,
         SurfaceMethod::Density => marched(&b.cx)?,
     };
     smooth(&mut mesh, b.cx.config.smoothing, 0.5 * b.cx.voxel as f32);
     let Some(query) = Query::new(&b.cx.model, Stream::Persistent, 0.0) else { return Ok(()) };
     let normals = match b.cx.config.method {
-        SurfaceMethod::Tsdf => vertex_normals(&mesh),
+        SurfaceMethod::Tsdf | SurfaceMethod::Both => vertex_normals(&mesh),
         SurfaceMethod::Density => {
             let length = b.cx.opaque_length();
             gradient_normals(
@@ -62,8 +62,21 @@ fn fused(cx: &Context, seen: &[SeenFrame]) -> Result<TriMesh, MapError> {
         max_depth: f32::INFINITY,
     };
     let frames: Vec<DepthFrame> = seen.iter().map(|s| depth_frame(&s.map)).collect();
-    let volume = TsdfVolume::fuse(&cx.spec, &frames, &options);
-    volume.and_then(|v| v.mesh()).map_err(MapError::extract("persistent"))
+    let failed = MapError::extract("persistent");
+    let volume = match TsdfVolume::fuse(&cx.spec, &frames, &options) {
+        Ok(volume) => volume,
+        Err(e) => return Err(failed(e)),
+    };
+    let query = Query::new(&cx.model, Stream::Persistent, 0.0);
+    match (cx.config.method, query) {
+        (SurfaceMethod::Both, Some(query)) => {
+            let density = opacity_grid(cx, &query)?;
+            // Both are positive inside and at most 1 away from the surface.
+            let both = volume.grid().or(&density, |opacity| 2.0 * (opacity - HALF));
+            both.and_then(|grid| march(&grid, 0.0)).map_err(failed)
+        }
+        _ => volume.mesh().map_err(failed),
+    }
 }
 
 /// Marches the density where the density grid says that there may be a surface.

@@ -4,14 +4,17 @@ use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
-use divff_exporters::manifest::{AttributeEntry, FORMAT_VERSION, MANIFEST_NAME, SkippedEntry, TimeInterval};
+use divff_exporters::manifest::{
+    AffordanceEntry, AttributeEntry, FORMAT_VERSION, FeatureEntry, MANIFEST_NAME, SkippedEntry, TimeInterval,
+};
+use divff_exporters::npz::write_npz_matrices;
 use divff_exporters::{
     AttributeValues, Geometry, GlbNode, GlbOptions, GlbScene, Manifest, NpzCompression, PlyOptions,
     write_glb, write_npz, write_ply, write_scene_glb,
 };
 use serde::{Deserialize, Serialize};
 
-use super::{MapError, MapObject, SemanticMap};
+use super::{MapError, MapFeatures, MapObject, SemanticMap};
 use crate::field::{Normalisation, Stream};
 
 /// Kinds of files that a map can be written as.
@@ -72,6 +75,7 @@ pub fn write(map: &SemanticMap, folder: &Path, formats: &[Format]) -> Result<Man
             export.scene(map)?;
         }
     }
+    export.feature_maps(map)?;
     let Export { manifest, .. } = export;
     for path in earlier.iter().filter(|old| manifest.files.iter().all(|f| f.path != **old)) {
         remove(&folder.join(path))?;
@@ -144,6 +148,18 @@ impl Export<'_> {
         Ok(self.manifest.add_file(self.folder, &file, map.points.positions.len(), 0)?)
     }
 
+    /// How compressed features become descriptors again: `<name>.npz` with `mean` and `basis`.
+    fn feature_maps(&mut self, map: &SemanticMap) -> Result<(), MapError> {
+        for features in &map.features {
+            let Some((mean, basis)) = &features.map else { continue };
+            let file = format!("{}.npz", features.name);
+            let matrices = [("mean", mean.len(), &mean[..]), ("basis", mean.len(), &basis[..])];
+            write_npz_matrices(&self.folder.join(&file), &matrices)?;
+            self.manifest.add_file(self.folder, &file, 0, 0)?;
+        }
+        Ok(())
+    }
+
     fn scene(&mut self, map: &SemanticMap) -> Result<(), MapError> {
         if map.objects.is_empty() {
             return Ok(());
@@ -203,11 +219,29 @@ fn describe(map: &SemanticMap) -> Manifest {
         streams: streams.map(|s| s.name().to_owned()).collect(),
         time_intervals: map.objects.iter().filter_map(interval).collect(),
         attributes: attributes(map),
+        features: map.features.iter().map(feature_entry).collect(),
+        affordances: map.affordances.iter().map(affordance_entry).collect(),
         skipped,
         tool_version: concat!("divff ", env!("CARGO_PKG_VERSION")).into(),
         seed: map.seed,
         ..Manifest::default()
     }
+}
+
+fn feature_entry(features: &MapFeatures) -> FeatureEntry {
+    FeatureEntry {
+        name: features.name.clone(),
+        dim: features.dim,
+        dtype: "f32".into(),
+        model: features.model.clone(),
+        // Codes are relative to a mean; what they stand for is normalised after decompression.
+        normalised: false,
+        pca_file: features.map.is_some().then(|| format!("{}.npz", features.name)),
+    }
+}
+
+fn affordance_entry((slug, phrase): &(String, String)) -> AffordanceEntry {
+    AffordanceEntry { name: slug.clone(), prompts: vec![phrase.clone()] }
 }
 
 fn world_from_train(n: &Normalisation) -> [[f64; 4]; 4] {

@@ -6,6 +6,7 @@ use crate::config::ConfigError;
 use crate::eval::EvalError;
 use crate::map::MapError;
 use crate::scene::SceneError;
+use crate::semantics::SemanticsError;
 use crate::train::TrainError;
 
 /// Why a run stopped.
@@ -21,6 +22,9 @@ pub enum PipelineError {
     /// Training failed.
     #[error(transparent)]
     Train(#[from] Box<TrainError>),
+    /// Features cannot be trained or asked.
+    #[error(transparent)]
+    Semantics(#[from] Box<SemanticsError>),
     /// The map cannot be built or written.
     #[error(transparent)]
     Map(#[from] Box<MapError>),
@@ -89,6 +93,12 @@ impl From<SceneError> for PipelineError {
 impl From<TrainError> for PipelineError {
     fn from(error: TrainError) -> Self {
         Self::Train(Box::new(error))
+    }
+}
+
+impl From<SemanticsError> for PipelineError {
+    fn from(error: SemanticsError) -> Self {
+        Self::Semantics(Box::new(error))
     }
 }
 

@@ -7,6 +7,7 @@ use divff_exporters::Manifest;
 
 use super::folder::create_writable;
 use super::metrics::{RunMetrics, peak_rss_mb, skipped_in_training};
+use super::semantics::SemanticEvaluation;
 use super::{Cost, Event, Observer, PipelineError, RunFolder};
 use crate::config::Config;
 use crate::eval::{self, RenderedView};
@@ -15,23 +16,27 @@ use crate::render::image::{RenderedFrame, render};
 use crate::render::refined::refined_camera;
 use crate::render::views::{Layer, quantised, write_view};
 use crate::scene::{Frame, Scene, Split};
+use crate::semantics::SemanticFields;
+use crate::semantics::layers::FeatureLayers;
 use crate::train::Trained;
 
 /// Layers of the files in `views/`.
 const VIEW_LAYERS: [Layer; 3] = [Layer::Rgb, Layer::Depth, Layer::Stream];
 
-/// Renders `frames` with the streams asked for, into `<stem>.png` and `<stem>.exr` in `out`.
+/// Renders `frames` with the streams, layers and features asked for, into `<stem>.png` and `<stem>.exr` in `out`.
 ///
 /// Returns the number of frames written: fewer than asked for if the observer said stop.
 ///
 /// # Errors
 /// A file cannot be written.
+#[allow(clippy::too_many_arguments)]
 pub fn render_views(
     trained: &Trained,
     config: &Config,
     frames: &[&Frame],
     streams: [bool; 3],
     layers: &[Layer],
+    features: Option<&FeatureLayers>,
     out: &Path,
     observer: &mut dyn Observer,
 ) -> Result<usize, PipelineError> {
@@ -45,7 +50,11 @@ pub fn render_views(
         let image = render(&model, frame, &sampling, 1);
         // Normals follow from the camera that the picture really was taken with.
         let (camera, c2w) = refined_camera(&trained.field, frame);
-        write_view(out, &frame.stem, &image, &camera, &c2w, layers, Vec::new())?;
+        let extra = match features {
+            Some(features) => features.render(&model, frame, &sampling)?.channels(),
+            None => Vec::new(),
+        };
+        write_view(out, &frame.stem, &image, &camera, &c2w, layers, extra)?;
         observer.event(&Event::Views { done: done + 1, total: frames.len() });
     }
     Ok(frames.len())
@@ -60,6 +69,7 @@ pub fn render_views(
 pub fn evaluate(
     scene: &Scene,
     trained: &Trained,
+    fields: Option<&SemanticFields>,
     config: &Config,
     run: &RunFolder,
     mut cost: Cost,
@@ -70,13 +80,15 @@ pub fn evaluate(
     let model = Model::new(&trained.field, &trained.grids, [true; 3]);
     let sampling = config.train.render_sampling();
     let total = scene.frames.iter().filter(|f| f.split == Split::Test).count();
+    let mut semantic = SemanticEvaluation::new(scene, fields, config)?;
     let mut done = 0;
     let mut quality = eval::evaluate_images(scene, |frame| {
         if observer.stop() {
             return Ok(None);
         }
         let image = render(&model, frame, &sampling, 1);
-        write_view(&run.views(), &frame.stem, &image, &frame.camera, &frame.c2w, &VIEW_LAYERS, Vec::new())?;
+        let extra = semantic.add(&model, frame, &sampling)?;
+        write_view(&run.views(), &frame.stem, &image, &frame.camera, &frame.c2w, &VIEW_LAYERS, extra)?;
         done += 1;
         observer.event(&Event::Views { done, total });
         Ok(Some(measurable(image)))
@@ -84,7 +96,10 @@ pub fn evaluate(
     if observer.stop() {
         return Ok(None);
     }
+    semantic.fill_in(&mut quality, &model, &sampling)?;
     let mut skipped = skipped_in_training(&trained.progress, trained.field.shape.streams);
+    let reasons = fields.map(|f| f.skipped.iter().map(|(what, why)| (what.clone(), why.clone().into())));
+    skipped.insert("features".to_owned(), serde_json::Value::Object(reasons.into_iter().flatten().collect()));
     // Without a manifest the files there are, if any, are not a whole map.
     match Manifest::read(&run.map()) {
         Ok(manifest) => {

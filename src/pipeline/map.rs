@@ -10,17 +10,22 @@ use super::{Cost, Event, Observer, PipelineError, Stage};
 use crate::config::Config;
 use crate::map::{self, Format};
 use crate::scene::Scene;
+use crate::semantics::SemanticFields;
+use crate::semantics::bake::annotate;
 use crate::train::Trained;
 
-/// Builds the map of a trained field and writes it to `out`, with the times that it took into `cost`.
+/// Builds the map of a trained field, with the features and scores of `fields`, and writes it to `out`, with the times
+/// that it took into `cost`.
 ///
 /// `None` if the observer said stop; the folder then holds no manifest, or an earlier map.
 ///
 /// # Errors
 /// The map cannot be built, or a file cannot be written.
+#[allow(clippy::too_many_arguments)]
 pub fn export_map(
     scene: &Scene,
     trained: &Trained,
+    fields: Option<&SemanticFields>,
     config: &Config,
     out: &Path,
     formats: &[Format],
@@ -30,7 +35,10 @@ pub fn export_map(
     create_writable(out)?;
     observer.event(&Event::Stage(Stage::Mapping));
     let start = Instant::now();
-    let map = map::build(scene, trained, config, &mut |p| observer.event(&Event::Mapping(p)))?;
+    let mut map = map::build(scene, trained, config, &mut |p| observer.event(&Event::Mapping(p)))?;
+    if let Some(fields) = fields {
+        annotate(&mut map, scene, trained, fields, &config.semantics)?;
+    }
     cost.extract_seconds = Some(start.elapsed().as_secs_f64());
     if observer.stop() {
         return Ok(None);

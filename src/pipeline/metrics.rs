@@ -29,6 +29,9 @@ pub struct Cost {
     /// Seconds of training, over all sessions.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub train_seconds: Option<f64>,
+    /// Seconds of training the fields of features.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub feature_seconds: Option<f64>,
     /// Seconds from the field to geometry in memory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub extract_seconds: Option<f64>,

@@ -10,6 +10,7 @@ pub mod folder;
 pub mod log;
 mod map;
 pub mod metrics;
+mod semantics;
 mod train;
 
 use std::path::PathBuf;
@@ -20,11 +21,13 @@ pub use fingerprint::fingerprint;
 pub use folder::{RunFolder, RunRecord};
 pub use map::export_map;
 pub use metrics::{Cost, RunMetrics};
+pub use semantics::{features, train_features};
 pub use train::train;
 
 use crate::config::Config;
 use crate::map::Format;
 use crate::scene::Scene;
+use crate::semantics::head::train::HeadProgress;
 use crate::train::Progress;
 
 /// Parts of a run, in order.
@@ -32,6 +35,8 @@ use crate::train::Progress;
 pub enum Stage {
     /// The field learns the scene.
     Training,
+    /// The fields of features learn what the scene's features say.
+    Features,
     /// Meshes and points are taken from the field.
     Mapping,
     /// The map is written.
@@ -64,6 +69,8 @@ pub enum Event<'a> {
     },
     /// Training moves on.
     Training(&'a Progress),
+    /// Training of the fields of features moves on.
+    Features(&'a HeadProgress),
     /// The map is being built.
     Mapping(crate::map::Progress),
     /// Frames are being rendered.
@@ -133,13 +140,16 @@ pub fn run(
     if !trained.progress.finished {
         return Ok(stopped);
     }
+    let Some(fields) = train_features(scene, &trained, config, &run, observer)? else { return Ok(stopped) };
+    cost.feature_seconds = Some(fields.seconds);
     let map = run.map();
-    let manifest = export_map(scene, &trained, config, &map, &Format::ALL, &mut cost, observer)?;
+    let manifest =
+        export_map(scene, &trained, Some(&fields), config, &map, &Format::ALL, &mut cost, observer)?;
     if manifest.is_none() {
         return Ok(stopped);
     }
     observer.event(&Event::Stage(Stage::Evaluating));
-    let Some(metrics) = evaluate(scene, &trained, config, &run, cost, observer)? else {
+    let Some(metrics) = evaluate(scene, &trained, Some(&fields), config, &run, cost, observer)? else {
         return Ok(stopped);
     };
     folder::write_json(&run.metrics_path(), &metrics)?;

@@ -21,6 +21,8 @@ pub struct Page<'a> {
     pub curve: Option<String>,
     /// Pictures per test frame.
     pub views: Vec<Vec<Figure>>,
+    /// Pictures per phrase.
+    pub queries: Vec<Vec<Figure>>,
     /// Pictures of the map.
     pub meshes: Vec<Figure>,
     /// Files of the map.
@@ -67,6 +69,7 @@ impl Page<'_> {
         );
         self.figures(&mut out);
         self.pictures(&mut out);
+        self.phrases(&mut out);
         self.surfaces(&mut out);
         self.training(&mut out);
         self.table_of_files(&mut out);
@@ -98,9 +101,12 @@ impl Page<'_> {
             ("SSIM", f(q.ssim, 3, "")),
             ("depth error, median", f(q.depth_median_abs_m, 3, " m")),
             ("streams, mean IoU", f(q.stream_miou, 3, "")),
+            ("objects by phrase, mean IoU", f(q.object_miou, 3, "")),
+            ("affordances by phrase, mean IoU", f(q.affordance_miou, 3, "")),
             ("surface, chamfer", f(q.persistent.as_ref().map(|s| s.chamfer_m), 3, " m")),
             ("surface, F-score at 5 cm", f(q.persistent.as_ref().map(|s| s.fscore_5cm), 3, "")),
             ("training", f(c.train_seconds, 0, " s")),
+            ("training of features", f(c.feature_seconds, 0, " s")),
             ("map from the field", f(c.extract_seconds, 1, " s")),
             ("writing the map", f(c.export_seconds, 1, " s")),
             ("field evaluations a second", f(c.samples_per_second.map(|v| v / 1e6), 1, " M")),
@@ -133,6 +139,19 @@ impl Page<'_> {
                 out.push_str("</p>");
             });
         }
+    }
+
+    fn phrases(&self, out: &mut String) {
+        if self.queries.is_empty() {
+            return;
+        }
+        section(out, "Phrases in held-out frames", |out| {
+            self.queries.iter().for_each(|figures| row(out, "row views", figures));
+            out.push_str(
+                "<p class=\"note\">A score of 0.5 means: as close to the phrase as to the nearest canonical \
+                 phrase. It is no probability.</p>",
+            );
+        });
     }
 
     fn surfaces(&self, out: &mut String) {

@@ -5,6 +5,7 @@
 mod chart;
 mod colour;
 mod embed;
+mod features;
 mod html;
 pub mod raster;
 
@@ -37,6 +38,9 @@ pub enum ReportError {
     /// A frame of the scene cannot be read.
     #[error(transparent)]
     Scene(#[from] Box<SceneError>),
+    /// The truth that phrases are compared with cannot be read.
+    #[error(transparent)]
+    Truth(#[from] Box<crate::eval::EvalError>),
     /// A picture cannot be read or stored.
     #[error("{}: {source}", path.display())]
     Picture {
@@ -62,6 +66,7 @@ pub fn write(run: &RunFolder, scene: &Scene) -> Result<(), PipelineError> {
         metrics: metrics::read(&run.metrics_path()).unwrap_or_default(),
         curve: chart::training_curve(&log::read(&run.log_path())?),
         views: views(run, scene)?,
+        queries: features::queries(run, scene)?,
         meshes: meshes(run, scene)?,
         files: files(run),
         config: config.to_toml(),
@@ -144,6 +149,11 @@ fn meshes(run: &RunFolder, scene: &Scene) -> Result<Vec<Figure>, ReportError> {
             let view = Viewpoint::around(centre, radius, direction(up, azimuth), up.as_vec3());
             figures.push(mesh_figure(&all, &view, format!("{caption}, from above"))?);
         }
+        for (name, caption) in features::features_of(all[0]) {
+            let view = Viewpoint::around(centre, radius, direction(up, 35.0), up.as_vec3());
+            let coloured: Vec<Geometry> = all.iter().filter_map(|g| features::coloured_by(g, name)).collect();
+            figures.push(mesh_figure(&coloured.iter().collect::<Vec<_>>(), &view, caption)?);
+        }
     }
     if let Some(frame) = frame {
         let view = Viewpoint {
@@ -214,6 +224,14 @@ fn middle(geometry: &Geometry) -> Option<(DVec3, f64)> {
     }
     let centre = (low + high).as_dvec3() * 0.5 + DVec3::from_array(geometry.offset);
     Some((centre, 0.5 * f64::from((high - low).length()).max(1e-9)))
+}
+
+/// A picture of geometries from above, from far enough to see most of the first; `up` is the axis that points upwards.
+/// `None` where there is nothing to see.
+pub fn overview(all: &[&Geometry], up: DVec3, width: usize, height: usize) -> Option<Picture> {
+    let (centre, radius) = middle(all.first()?)?;
+    let view = Viewpoint::around(centre, radius, direction(up, 35.0), up.as_vec3());
+    Some(rasterise(all, &view, width, height))
 }
 
 /// The files of the map and what is in them; without a manifest the map is not complete.

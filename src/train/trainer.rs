@@ -42,6 +42,9 @@ const LOOK_BLOCK: u32 = 4;
 /// Mean colour error of a block (0-1) that blur and noise do not explain.
 const WRONG_COLOUR: f32 = 0.12;
 
+/// Steps after which a persistent stream is sharp enough for that.
+const SETTLE_AFTER: u64 = 500;
+
 /// Share of such blocks above which something moves.
 const MOVING_SHARE: f64 = 0.03;
 
@@ -146,7 +149,7 @@ impl Trainer {
         let mut window = Window::new();
         while !self.trained.progress.finished {
             let fraction = self.fraction(budget);
-            if !self.trained.progress.streams_settled && fraction >= self.config.train.static_until {
+            if !self.trained.progress.streams_settled && self.stands(fraction) {
                 self.settle_streams();
             }
             let stereo_at = self.config.train.stereo_at;
@@ -254,6 +257,14 @@ impl Trainer {
         field.weights[refinement.clone()].copy_from_slice(then);
         self.pixels.look_at_depth(field, &self.config.stereo);
         field.weights[refinement].copy_from_slice(&now);
+    }
+
+    /// Whether the persistent stream has had its time alone. A short training gives it more than its share, up to double
+    /// and half of all, since what is still blurred looks like something that has moved.
+    fn stands(&self, fraction: f64) -> bool {
+        let share = self.config.train.static_until;
+        let late = (2.0 * share).min(0.5).max(share);
+        fraction >= share && (self.trained.progress.step >= SETTLE_AFTER || fraction >= late)
     }
 
     /// Decides which streams the scene needs, once the persistent one has had its time alone.

@@ -43,7 +43,9 @@ fn a_stopped_run_that_goes_on_gives_the_bytes_of_an_uninterrupted_one() {
     assert_eq!((trained.progress.step, trained.progress.finished), (400, true));
     let cost = &mut Cost::default();
     let map = stopped.map();
-    pipeline::export_map(&scene, &trained, &config, &map, &Format::ALL, cost, &mut ()).unwrap().unwrap();
+    pipeline::export_map(&scene, &trained, None, &config, &map, &Format::ALL, cost, &mut ())
+        .unwrap()
+        .unwrap();
     assert_same_files(&map, &run().join("map"));
     let log = fs::read_to_string(stopped.log_path()).unwrap();
     assert_eq!(log.lines().count(), 8, "{log}");

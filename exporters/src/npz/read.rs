@@ -40,6 +40,34 @@ pub fn read_npz(path: &Path) -> Result<Geometry> {
     Ok(geometry)
 }
 
+/// A matrix: name, columns, row-major values.
+pub type Matrix = (String, usize, Vec<f32>);
+
+/// Reads what [`super::write_npz_matrices`] writes.
+///
+/// # Errors
+/// As [`read_npz`]; arrays of other types than <f4 are `Unsupported`.
+pub fn read_npz_matrices(path: &Path) -> Result<Vec<Matrix>> {
+    let file = File::open(path).map_err(|source| Error::io(path, source))?;
+    let file_bytes = file.metadata().map_err(|source| Error::io(path, source))?.len();
+    let mut archive = ZipArchive::new(BufReader::new(file)).map_err(|error| zip_error(path, error))?;
+    let mut matrices = Vec::with_capacity(archive.len());
+    for index in 0..archive.len() {
+        let (name, content) = read_entry(path, &mut archive, index, file_bytes)?;
+        let array = parse_array(path, &name, &content)?;
+        if array.dtype != Dtype::F32 {
+            return Err(Error::Unsupported {
+                path: path.to_owned(),
+                what: format!("array `{name}`: its type {}", array.dtype.descr()),
+                remedy: "save <f4 arrays of one or two dimensions",
+            });
+        }
+        let values = floats(&array);
+        matrices.push((name, array.columns, values));
+    }
+    Ok(matrices)
+}
+
 fn zip_error(path: &Path, error: ZipError) -> Error {
     match error {
         ZipError::Io(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => Error::io(path, source),

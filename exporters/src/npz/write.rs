@@ -7,7 +7,7 @@ use serde_json::json;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
 use crate::atomic::{AtomicWriter, write_atomically};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::geometry::{AttributeValues, Geometry};
 use crate::npy::{self, Dtype};
 
@@ -35,6 +35,26 @@ pub fn write_npz(path: &Path, geometry: &Geometry, compression: NpzCompression) 
         archive.geometry(geometry)?;
         let note = json!({ "name": geometry.name, "offset": geometry.offset });
         archive.zip.set_comment(note.to_string());
+        archive.zip.finish()?;
+        Ok(())
+    })
+}
+
+/// Writes matrices that belong to no vertices: name, columns and row-major values of each.
+///
+/// # Errors
+/// `Inconsistent` for values that do not fill their rows; `Io`.
+pub fn write_npz_matrices(path: &Path, matrices: &[(&str, usize, &[f32])]) -> Result<()> {
+    let uneven = |m: &&(&str, usize, &[f32])| m.1 == 0 || m.2.len() % m.1 != 0;
+    if let Some((name, columns, values)) = matrices.iter().find(uneven) {
+        let reason = format!("`{name}` has {} values in {columns} columns", values.len());
+        return Err(Error::inconsistent(&path.display().to_string(), reason));
+    }
+    write_atomically(path, |file| {
+        let mut archive = Archive { zip: ZipWriter::new(file), compression: NpzCompression::Stored };
+        for (name, columns, values) in matrices {
+            archive.floats(name, *columns, values)?;
+        }
         archive.zip.finish()?;
         Ok(())
     })

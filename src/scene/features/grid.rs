@@ -134,6 +134,18 @@ pub struct PatchGrid {
 }
 
 impl PatchGrid {
+    /// Left, top, right and bottom of a patch in px of an image of `image_px`; `None` if it has no usable descriptor.
+    pub fn area(&self, row: usize, col: usize, image_px: [f64; 2]) -> Option<[f64; 4]> {
+        if !self.descriptors.is_usable(row * self.cols + col) {
+            return None;
+        }
+        let side = |axis: usize, n: usize, end: f64| {
+            let from_centre = (end - 0.5) * self.layout.size_px[axis];
+            (self.layout.centre(axis, n) + from_centre) * image_px[axis] / self.layout.image_px[axis]
+        };
+        Some([side(0, col, 0.0), side(1, row, 0.0), side(0, col, 1.0), side(1, row, 1.0)])
+    }
+
     /// The patches at a position (`[x, y]`, px of an image of `image_px`) as rows of `descriptors`.
     ///
     /// Patches without a usable descriptor do not count; `None` if no patch around has one.

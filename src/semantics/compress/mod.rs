@@ -240,6 +240,15 @@ impl Compressor {
         }
     }
 
+    /// A linear map that is known: mean `[full]` and basis `[dim, full]` of orthonormal rows.
+    ///
+    /// # Errors
+    /// [`CompressError::Stored`] for lengths that do not fit, or a basis that is none.
+    pub fn from_linear(mean: Vec<f32>, basis: Vec<f32>) -> Result<Self, CompressError> {
+        let dim = basis.len() / mean.len().max(1);
+        Ok(Self { map: Map::Linear(LinearMap::checked(mean, basis, dim)?), error: 0.0 })
+    }
+
     /// A stored compressor; `fetch` gives an array by its name.
     ///
     /// # Errors

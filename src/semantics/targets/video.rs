@@ -103,6 +103,16 @@ impl VideoTargets {
         (0..self.frames.len()).filter(has)
     }
 
+    /// The patches of a frame: left, top, right and bottom, px, and row of the table.
+    pub fn patches(&self, frame: usize) -> Vec<([f64; 4], u32)> {
+        let Some((first, grid)) = &self.frames[frame].patches else { return Vec::new() };
+        let area = |n: usize| {
+            let area = grid.area(n / grid.cols, n % grid.cols, self.image_px[frame])?;
+            Some((area, first + n as u32))
+        };
+        (0..grid.rows * grid.cols).filter_map(area).collect()
+    }
+
     /// What the pixel in column `x`, row `y` of frame `frame` should look like.
     pub fn at(&self, frame: usize, x: u32, y: u32) -> VideoTarget {
         let (position, image_px) = (centre(x, y), self.image_px[frame]);

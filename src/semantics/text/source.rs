@@ -44,6 +44,14 @@ impl TextSource {
         Ok(Self { scene: store.text(space)?, ..Self::new(space, dim) })
     }
 
+    /// The embeddings that lie in `text/` of a folder, which need not be a scene.
+    ///
+    /// # Errors
+    /// [`TextError::Features`]: they are damaged.
+    pub fn of_folder(root: &Path, space: Space) -> Result<Self, TextError> {
+        Ok(Self { scene: TextTable::read(root, space)?, ..Self::new(space, None) })
+    }
+
     /// Adds embeddings of `phrases` from a file, one row for each, in order.
     ///
     /// # Errors

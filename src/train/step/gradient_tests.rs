@@ -97,10 +97,10 @@ fn trace_with(seed: u64, precision: Precision) -> Traced {
     plan.rig_rate = 1.0;
     // Large enough that one per cent of a term is more than the tolerance.
     let config = LossConfig {
-        transient: 0.1,
+        transient: 1.0,
         distortion: 10.0,
         entropy: 5.0,
-        flatness: 5.0,
+        flatness: 300.0,
         exposure: 100.0,
         ..config.loss
     };

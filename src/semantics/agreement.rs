@@ -1,0 +1,110 @@
+//! How well rendered features agree with what they were learned from.
+
+use rayon::prelude::*;
+
+use super::compress::Compressor;
+use super::config::SemanticsConfig;
+use super::error::SemanticsError;
+use super::fields::SemanticFields;
+use super::head::{HeadModel, render_features, trace_frame};
+use super::targets::{ImageTargets, TargetTable, VideoTargets};
+use crate::field::mlp::Precision;
+use crate::render::forward::Model;
+use crate::render::sampler::Sampling;
+use crate::scene::features::{Blend, FeatureStore, Space};
+use crate::scene::{Frame, Scene, Split};
+
+/// Frames of a split that are looked at, evenly spread; not all of them have features.
+const FRAMES: usize = 24;
+
+/// Every so many pixels along a frame's rows and columns.
+const STRIDE: u32 = 4;
+
+/// Mean cosine between rendered descriptors and those of the scene, for each space: over test frames if they have
+/// features, else over training frames. With the split; `None` where there is nothing to compare.
+///
+/// # Errors
+/// Features that cannot be read.
+pub fn feature_cosines(
+    scene: &Scene,
+    model: &Model,
+    fields: &SemanticFields,
+    config: &SemanticsConfig,
+    sampling: &Sampling,
+) -> Result<[Option<(f64, Split)>; 2], SemanticsError> {
+    let store = FeatureStore::open(scene)?;
+    let mut found = [None, None];
+    for split in [Split::Test, Split::Train] {
+        let all: Vec<&Frame> = scene.frames.iter().filter(|f| f.split == split).collect();
+        let count = all.len().min(FRAMES);
+        let frames: Vec<Frame> = (0..count).map(|n| all[n * all.len() / count].clone()).collect();
+        for (n, field) in fields.spaces.iter().enumerate() {
+            let (Some(field), None) = (field, found[n]) else { continue };
+            let heads = HeadModel::new(&field.heads, Precision::F32);
+            let rendered = |frame: &Frame| {
+                let sources = trace_frame(model, frame, sampling, config.samples);
+                render_features(&heads, &sources, frame.time as f32).values
+            };
+            let of = Compared { compressor: &field.compressor, frames: &frames };
+            let mean = match field.space {
+                Space::Clip => ImageTargets::load(&store, &frames, config.image)?
+                    .and_then(|t| of.mean(&t.table, t.frames().collect(), rendered, |f, x, y| t.at(f, x, y))),
+                Space::Egovideo => VideoTargets::load(&store, &frames, config.video)?.and_then(|t| {
+                    of.mean(&t.table, t.frames().collect(), rendered, |f, x, y| t.at(f, x, y).patch)
+                }),
+            };
+            found[n] = mean.map(|m| (m, split));
+        }
+    }
+    Ok(found)
+}
+
+struct Compared<'a> {
+    compressor: &'a Compressor,
+    frames: &'a [Frame],
+}
+
+impl Compared<'_> {
+    fn mean(
+        &self,
+        table: &TargetTable,
+        with: Vec<usize>,
+        rendered: impl Fn(&Frame) -> Vec<f32>,
+        target: impl Fn(usize, u32, u32) -> Option<Blend> + Sync,
+    ) -> Option<f64> {
+        let (full, dim) = (table.dim(), self.compressor.dim());
+        let (mut sum, mut count) = (0.0, 0usize);
+        for n in with {
+            let camera = &self.frames[n].camera;
+            let wanted: Vec<(usize, Blend)> = (0..camera.height)
+                .step_by(STRIDE as usize)
+                .flat_map(|y| (0..camera.width).step_by(STRIDE as usize).map(move |x| (x, y)))
+                .filter_map(|(x, y)| Some(((y * camera.width + x) as usize, target(n, x, y)?)))
+                .collect();
+            if wanted.is_empty() {
+                continue;
+            }
+            let codes = rendered(&self.frames[n]);
+            let cosines: Vec<f64> = wanted
+                .par_iter()
+                .map(|(pixel, blend)| {
+                    let (mut truth, mut ours) = (vec![0.0; full], vec![0.0; full]);
+                    table.blend(blend, &mut truth);
+                    self.compressor.decode(&codes[pixel * dim..][..dim], &mut ours);
+                    cosine(&truth, &ours)
+                })
+                .collect();
+            sum += cosines.iter().sum::<f64>();
+            count += cosines.len();
+        }
+        (count > 0).then(|| sum / count as f64)
+    }
+}
+
+/// Cosine of two vectors; 0 where one is zero.
+fn cosine(a: &[f32], b: &[f32]) -> f64 {
+    let dot =
+        |a: &[f32], b: &[f32]| -> f64 { a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum() };
+    let norms = (dot(a, a) * dot(b, b)).sqrt();
+    if norms > 0.0 { dot(a, b) / norms } else { 0.0 }
+}

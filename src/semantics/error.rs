@@ -1,0 +1,78 @@
+//! What can go wrong with features.
+
+use std::path::PathBuf;
+
+use super::compress::CompressError;
+use super::relevancy::RelevancyError;
+use super::text::TextError;
+use crate::scene::SceneError;
+use crate::scene::features::{FeatureError, Space};
+
+/// Why features cannot be trained, stored or asked.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SemanticsError {
+    /// A feature file cannot be used.
+    #[error(transparent)]
+    Feature(Box<FeatureError>),
+    /// A frame cannot be read.
+    #[error(transparent)]
+    Scene(Box<SceneError>),
+    /// Descriptors cannot be compressed.
+    #[error("descriptors cannot be compressed: {0}")]
+    Compress(#[from] CompressError),
+    /// Points cannot be held against phrases.
+    #[error(transparent)]
+    Relevancy(#[from] RelevancyError),
+    /// A phrase cannot be embedded.
+    #[error(transparent)]
+    Text(Box<TextError>),
+    /// The run has no features of a space.
+    #[error("{} features: {why}; train the run on a scene that has them", space.name())]
+    NoFeatures {
+        /// The space.
+        space: Space,
+        /// Why there are none.
+        why: String,
+    },
+    /// A file of trained features is damaged, or of another version.
+    #[error("{}: {what}; {remedy}", path.display())]
+    Stored {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// A file cannot be read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// A file cannot be written.
+    #[error(transparent)]
+    Write(#[from] divff_exporters::Error),
+}
+
+// Boxed: these errors are large, and every result here would carry their size.
+impl From<FeatureError> for SemanticsError {
+    fn from(error: FeatureError) -> Self {
+        Self::Feature(Box::new(error))
+    }
+}
+
+impl From<TextError> for SemanticsError {
+    fn from(error: TextError) -> Self {
+        Self::Text(Box::new(error))
+    }
+}
+
+impl From<SceneError> for SemanticsError {
+    fn from(error: SceneError) -> Self {
+        Self::Scene(Box::new(error))
+    }
+}

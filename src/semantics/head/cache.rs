@@ -1,0 +1,161 @@
+//! Rays traced once: where the light of a pixel comes from, at frozen geometry.
+
+use glam::Vec3;
+use pulp::{Simd, WithSimd};
+use rayon::prelude::*;
+
+use crate::render::forward::{Chunk, Model, RayInput, Tracer};
+use crate::render::rays::View;
+use crate::render::sampler::Sampling;
+
+/// Rays traced together.
+const CHUNK_RAYS: usize = 32;
+/// Chunks of one task.
+const TASK_CHUNKS: usize = 16;
+/// Samples that give less than this share of a ray's light are not kept.
+const NEGLIGIBLE: f32 = 0.005;
+
+/// A place that a pixel's light comes from: 9 bytes of content.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Source {
+    /// Position in the coordinates of the stream, as fractions of 65535.
+    place: [u16; 3],
+    /// Share of the light of the sources that were kept, in 65535ths.
+    share: u16,
+    /// Which stream.
+    pub stream: u8,
+}
+
+impl Source {
+    /// Position in the coordinates of the stream: units, or the actor's frustum.
+    pub fn position(&self) -> Vec3 {
+        Vec3::from_array(self.place.map(|v| f32::from(v) / 65535.0))
+    }
+
+    /// Share of the light; those of a ray sum to 1 up to rounding.
+    pub fn share(&self) -> f32 {
+        f32::from(self.share) / 65535.0
+    }
+}
+
+/// The sources of many rays.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Sources {
+    /// Ray `n` has the sources `first[n]..first[n + 1]`.
+    first: Vec<u32>,
+    sources: Vec<Source>,
+    /// Opacity of each ray.
+    pub opacity: Vec<f32>,
+}
+
+impl Sources {
+    /// Traces `inputs`, rays of `views`, and keeps of each at most `keep` samples.
+    ///
+    /// The result does not depend on the number of threads.
+    pub fn trace(
+        model: &Model,
+        views: &[View],
+        inputs: &[RayInput],
+        sampling: &Sampling,
+        keep: usize,
+    ) -> Self {
+        let arch = pulp::Arch::new();
+        let parts: Vec<Self> = inputs
+            .par_chunks(CHUNK_RAYS * TASK_CHUNKS)
+            .map(|inputs| arch.dispatch(TracePass { model, views, inputs, sampling, keep }))
+            .collect();
+        let mut all = Self { first: vec![0], ..Self::default() };
+        for part in parts {
+            let start = all.sources.len() as u32;
+            all.first.extend(part.first[1..].iter().map(|f| f + start));
+            all.sources.extend(part.sources);
+            all.opacity.extend(part.opacity);
+        }
+        all
+    }
+
+    /// Rays whose samples have the given weights, streams and positions.
+    #[cfg(test)]
+    pub(super) fn of_rays(rays: Vec<Vec<(f32, u8, Vec3)>>) -> Self {
+        let mut all = Self { first: vec![0], ..Self::default() };
+        for mut found in rays {
+            all.add(1.0, &mut found, usize::MAX);
+        }
+        all
+    }
+
+    /// Number of rays.
+    pub fn len(&self) -> usize {
+        self.opacity.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.opacity.is_empty()
+    }
+
+    /// Sources of ray `n`, those with the largest share first.
+    pub fn of(&self, n: usize) -> &[Source] {
+        &self.sources[self.first[n] as usize..self.first[n + 1] as usize]
+    }
+
+    /// Number of sources of all rays.
+    pub fn count(&self) -> usize {
+        self.sources.len()
+    }
+}
+
+struct TracePass<'a> {
+    model: &'a Model<'a>,
+    views: &'a [View],
+    inputs: &'a [RayInput],
+    sampling: &'a Sampling,
+    keep: usize,
+}
+
+impl WithSimd for TracePass<'_> {
+    type Output = Sources;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Sources {
+        let Self { model, views, inputs, sampling, keep } = self;
+        let (mut chunk, mut tracer) = (Chunk::default(), Tracer::default());
+        let mut out = Sources { first: vec![0], ..Sources::default() };
+        let mut found: Vec<Vec<(f32, u8, Vec3)>> = vec![Vec::new(); CHUNK_RAYS];
+        for inputs in inputs.chunks(CHUNK_RAYS) {
+            chunk.densities(simd, &mut tracer, model, views, inputs, sampling);
+            for (s, batch) in chunk.batches.iter().enumerate() {
+                for (k, p) in batch.points() {
+                    let weight = chunk.weighted[k].weight[s];
+                    if weight > 0.0 {
+                        found[k / sampling.count].push((weight, s as u8, p));
+                    }
+                }
+            }
+            for (ray, found) in chunk.rays.iter().zip(&mut found) {
+                out.add(1.0 - ray.left, found, keep);
+                found.clear();
+            }
+        }
+        out
+    }
+}
+
+impl Sources {
+    /// Adds a ray whose samples have the given weights.
+    fn add(&mut self, opacity: f32, found: &mut Vec<(f32, u8, Vec3)>, keep: usize) {
+        let total: f32 = found.iter().map(|f| f.0).sum();
+        found.sort_by(|a, b| b.0.total_cmp(&a.0));
+        found.truncate(keep);
+        found.retain(|f| f.0 >= NEGLIGIBLE * total);
+        let kept: f32 = found.iter().map(|f| f.0).sum();
+        let fraction = |v: f32| (v.clamp(0.0, 1.0) * 65535.0 + 0.5) as u16;
+        self.sources.extend(found.iter().map(|(weight, stream, p)| Source {
+            place: p.to_array().map(fraction),
+            share: fraction(weight / kept),
+            stream: *stream,
+        }));
+        self.first.push(self.sources.len() as u32);
+        self.opacity.push(opacity.clamp(0.0, 1.0));
+    }
+}

@@ -1,0 +1,384 @@
+//! One training step of the fields of a space at frozen geometry.
+//!
+//! The loss of a ray is W |Σ w f − z|² over the descriptor and, with weights of its own, over the part feature. Where a
+//! descriptor tells of many rays together, as that of a patch does, it is |mean (Σ w f) − z|² over rays of the bag. As in
+//! the training of geometry, a fixed number of groups have a gradient each, and every table is updated by one task
+//! that walks the groups in order: the result does not depend on the number of threads.
+
+use pulp::{Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::cache::Sources;
+use super::{HeadModel, Heads};
+use crate::field::hashgrid::{FEATURES, Level, Row};
+use crate::field::mlp::{Activations, Precision};
+use crate::field::stream::StreamBatch;
+use crate::rng::Rng;
+use crate::simd::TILE;
+use crate::simd::matrix::Unit;
+use crate::train::adam::{self, Moments, StepSize, TableState};
+
+/// Groups that a step is divided into; fixed, so that sums are taken in the same order on any machine.
+const GROUPS: usize = 16;
+
+/// What the rays of a cache should look like, for one space.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RayTargets {
+    /// Numbers per ray: descriptor, then part feature.
+    pub width: usize,
+    /// How many of them are the descriptor's.
+    pub dim: usize,
+    /// `[rays, width]`.
+    pub values: Vec<half::f16>,
+    /// Weights of the two parts of the loss; 0: no target.
+    pub weights: Vec<[f32; 2]>,
+    /// Rays with a target.
+    pub usable: Vec<u32>,
+    /// Time of each ray.
+    pub times: Vec<f32>,
+    /// Rays that share a descriptor; if there are any, steps choose among them and not among `usable`.
+    pub bags: Bags,
+}
+
+/// Rays that one descriptor describes together: those of a patch, or of a hotspot.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Bags {
+    /// Bag `n` has the rays `members[first[n]..first[n + 1]]`, at least one.
+    pub first: Vec<u32>,
+    /// Rays.
+    pub members: Vec<u32>,
+    /// `[bags, dim]`.
+    pub values: Vec<half::f16>,
+}
+
+impl Bags {
+    /// Adds a bag; one without rays is left out.
+    pub fn push(&mut self, rays: impl IntoIterator<Item = u32>, value: &[f32]) {
+        if self.first.is_empty() {
+            self.first.push(0);
+        }
+        let before = self.members.len();
+        self.members.extend(rays);
+        if self.members.len() > before {
+            self.first.push(self.members.len() as u32);
+            self.values.extend(value.iter().map(|v| half::f16::from_f32(*v)));
+        }
+    }
+
+    /// Number of bags.
+    pub fn len(&self) -> usize {
+        self.first.len().saturating_sub(1)
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// These bags with the rays that `keep` says; `dim` numbers a descriptor.
+    pub fn only(&self, dim: usize, keep: impl Fn(&u32) -> bool) -> Self {
+        let mut kept = Self::default();
+        for n in 0..self.len() {
+            let value: Vec<f32> = self.values[n * dim..][..dim].iter().map(|v| v.to_f32()).collect();
+            kept.push(self.of(n).iter().copied().filter(&keep), &value);
+        }
+        kept
+    }
+
+    /// Rays of bag `n`.
+    pub fn of(&self, n: usize) -> &[u32] {
+        &self.members[self.first[n] as usize..self.first[n + 1] as usize]
+    }
+}
+
+/// What a step is told.
+#[derive(Clone, Copy, Debug)]
+pub struct HeadStep {
+    /// Number of the step, from 1.
+    pub step: u64,
+    /// Rays; rounded up to whole groups.
+    pub rays: usize,
+    /// Rays of a bag that are rendered.
+    pub bag: usize,
+    /// Learning rate of the tables.
+    pub table_rate: f32,
+    /// Learning rate of the networks.
+    pub network_rate: f32,
+    /// What the networks are multiplied in.
+    pub precision: Precision,
+    /// Seed of everything random.
+    pub seed: u64,
+}
+
+/// State of the training of one space.
+pub struct HeadOptimiser {
+    moments: [Moments; 3],
+    tables: [Vec<TableState>; 3],
+    groups: Vec<Group>,
+}
+
+/// Rays of one group and what they left.
+#[derive(Default)]
+pub(super) struct Group {
+    rays: Vec<u32>,
+    /// Bags that the rays are of, each with as many rays; empty if each ray is by itself.
+    bags: Vec<u32>,
+    batches: [StreamBatch; 3],
+    /// Share of each lane in its ray.
+    shares: [Vec<f32>; 3],
+    activations: [Activations; 3],
+    /// `[rays, width]`: what is rendered, then the gradient with respect to it.
+    rendered: Vec<f32>,
+    /// Gradients of the networks.
+    pub(super) gradient: [Vec<f32>; 3],
+    /// Sum over the rays.
+    pub(super) loss: f64,
+}
+
+impl HeadOptimiser {
+    /// Fresh state.
+    pub fn new(heads: &Heads) -> Self {
+        Self {
+            moments: heads.weights.each_ref().map(|w| Moments::new(w.len())),
+            tables: heads.tables.each_ref().map(|t| t.iter().map(|t| TableState::new(t.len())).collect()),
+            groups: (0..GROUPS).map(|_| Group::default()).collect(),
+        }
+    }
+
+    /// Runs one step; the mean loss of its rays.
+    pub fn step(
+        &mut self,
+        heads: &mut Heads,
+        sources: &Sources,
+        targets: &RayTargets,
+        plan: &HeadStep,
+    ) -> f64 {
+        let bags =
+            if targets.bags.is_empty() { 0 } else { (plan.rays / plan.bag.max(1)).div_ceil(GROUPS).max(1) };
+        let per_group = if bags > 0 { bags * plan.bag.max(1) } else { plan.rays.div_ceil(GROUPS) };
+        let count = (per_group * GROUPS) as f32;
+        let model = HeadModel::new(heads, plan.precision);
+        let arch = pulp::Arch::new();
+        self.groups.par_iter_mut().enumerate().for_each(|(n, group)| {
+            let mut rng = Rng::new(plan.seed, plan.step, n as u64);
+            group.choose(&mut rng, targets, per_group, bags);
+            arch.dispatch(GroupPass { group, model: &model, sources, targets, count });
+        });
+        drop(model);
+        self.update(heads, plan);
+        self.groups.iter().map(|g| g.loss).sum::<f64>() / f64::from(count)
+    }
+
+    fn update(&mut self, heads: &mut Heads, plan: &HeadStep) {
+        let Self { moments, tables, groups } = self;
+        let groups = &groups[..];
+        let (arch, rate) = (pulp::Arch::new(), StepSize::new(plan.table_rate, plan.step));
+        rayon::scope(|scope| {
+            for (s, (tables, states)) in heads.tables.iter_mut().zip(tables).enumerate() {
+                let Some(net) = &heads.nets[s] else { continue };
+                let levels = net.grid.levels.iter().enumerate();
+                // Finest levels first: they take longest.
+                for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)).rev() {
+                    let pass = TablePass { groups, stream: s, number, level, table, state, rate };
+                    scope.spawn(move |_| arch.dispatch(pass));
+                }
+            }
+        });
+        let rate = StepSize::new(plan.network_rate, plan.step);
+        for (s, (weights, moments)) in heads.weights.iter_mut().zip(moments).enumerate() {
+            let mut gradient = vec![0.0; weights.len()];
+            for group in groups {
+                gradient.iter_mut().zip(&group.gradient[s]).for_each(|(g, d)| *g += d);
+            }
+            adam::update(weights, &gradient, &mut moments.first, &mut moments.second, rate);
+        }
+    }
+}
+
+pub(super) struct GroupPass<'a> {
+    pub(super) group: &'a mut Group,
+    pub(super) model: &'a HeadModel<'a>,
+    pub(super) sources: &'a Sources,
+    pub(super) targets: &'a RayTargets,
+    /// Rays of the whole step.
+    pub(super) count: f32,
+}
+
+impl WithSimd for GroupPass<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { group, model, sources, targets, count } = self;
+        group.place(sources, targets);
+        group.render(simd, model, targets.width);
+        group.compare(targets, count);
+        group.back(simd, model, targets.width);
+    }
+}
+
+impl Group {
+    /// A group of the given rays, or bags of rays.
+    #[cfg(test)]
+    pub(super) fn of(rays: Vec<u32>, bags: Vec<u32>) -> Self {
+        Self { rays, bags, ..Self::default() }
+    }
+
+    /// Chooses `count` rays, or as many of `bags` bags.
+    fn choose(&mut self, rng: &mut Rng, targets: &RayTargets, count: usize, bags: usize) {
+        let Self { rays, bags: chosen, .. } = self;
+        rays.clear();
+        chosen.clear();
+        if bags == 0 {
+            rays.extend((0..count).map(|_| targets.usable[rng.below(targets.usable.len())]));
+            // Neighbours in the cache are neighbours in a picture, and share table rows.
+            rays.sort_unstable();
+            return;
+        }
+        for _ in 0..bags {
+            let bag = rng.below(targets.bags.len());
+            let members = targets.bags.of(bag);
+            chosen.push(bag as u32);
+            rays.extend((0..count / bags).map(|_| members[rng.below(members.len())]));
+        }
+    }
+
+    /// Gradient of lane by lane encodings, after [`GroupPass`]: positions and rows of stream `s`.
+    #[cfg(test)]
+    pub(super) fn batch(&self, s: usize) -> &StreamBatch {
+        &self.batches[s]
+    }
+
+    /// The samples of all rays.
+    fn place(&mut self, sources: &Sources, targets: &RayTargets) {
+        let Self { rays, batches, shares, .. } = self;
+        batches.iter_mut().for_each(StreamBatch::clear);
+        shares.iter_mut().for_each(Vec::clear);
+        for (n, ray) in rays.iter().enumerate() {
+            let time = targets.times[*ray as usize];
+            for source in sources.of(*ray as usize) {
+                let s = usize::from(source.stream);
+                batches[s].push(n, n, source.position(), time);
+                shares[s].push(source.share());
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn render<S: Simd>(&mut self, simd: S, model: &HeadModel, width: usize) {
+        let Self { rays, batches, shares, activations, rendered, .. } = self;
+        rendered.clear();
+        rendered.resize(rays.len() * width, 0.0);
+        for (s, batch) in batches.iter_mut().enumerate().filter(|(_, b)| !b.is_empty()) {
+            let rays: Vec<u32> = batch.sample.clone();
+            model.forward(simd, s, batch, &mut activations[s], |tile, rows| {
+                let lanes = rays[tile * TILE..].iter().zip(&shares[s][tile * TILE..]).take(TILE);
+                for (lane, (ray, share)) in lanes.enumerate() {
+                    let out = &mut rendered[*ray as usize * width..][..width];
+                    for (k, o) in out.iter_mut().enumerate() {
+                        *o += share * rows[k * TILE + lane];
+                    }
+                }
+            });
+        }
+    }
+
+    /// Replaces what was rendered by the gradient of the loss with respect to it.
+    fn compare(&mut self, targets: &RayTargets, count: f32) {
+        let (width, dim) = (targets.width, targets.dim);
+        self.loss = 0.0;
+        let off = self.off_bags(targets);
+        for (ray, rendered) in self.rays.iter().zip(self.rendered.chunks_exact_mut(width)) {
+            let ray = *ray as usize;
+            let target = &targets.values[ray * width..][..width];
+            let mut loss = 0.0;
+            for (k, (r, t)) in rendered.iter_mut().zip(target).enumerate() {
+                let weight = targets.weights[ray][usize::from(k >= dim)];
+                let off = *r - t.to_f32();
+                loss += weight * off * off;
+                *r = 2.0 * weight * off / count;
+            }
+            self.loss += f64::from(loss);
+        }
+        let Some(per_bag) = self.rays.len().checked_div(self.bags.len()) else { return };
+        for (off, rays) in off.chunks_exact(dim).zip(self.rendered.chunks_exact_mut(per_bag * width)) {
+            self.loss += per_bag as f64 * off.iter().map(|v| f64::from(v * v)).sum::<f64>();
+            for rendered in rays.chunks_exact_mut(width) {
+                rendered.iter_mut().zip(off).for_each(|(r, off)| *r += 2.0 * off / count);
+            }
+        }
+    }
+
+    /// Mean of what was rendered for the rays of each bag, minus what it should be: `[bags, dim]`.
+    fn off_bags(&self, targets: &RayTargets) -> Vec<f32> {
+        let (width, dim) = (targets.width, targets.dim);
+        let Some(per_bag) = self.rays.len().checked_div(self.bags.len()) else { return Vec::new() };
+        let mut off = vec![0.0; self.bags.len() * dim];
+        let rays = self.rendered.chunks_exact(per_bag * width);
+        for ((off, bag), rays) in off.chunks_exact_mut(dim).zip(&self.bags).zip(rays) {
+            for rendered in rays.chunks_exact(width) {
+                off.iter_mut().zip(rendered).for_each(|(o, r)| *o += r / per_bag as f32);
+            }
+            let wanted = &targets.bags.values[*bag as usize * dim..][..dim];
+            off.iter_mut().zip(wanted).for_each(|(o, w)| *o -= w.to_f32());
+        }
+        off
+    }
+
+    #[inline(always)]
+    fn back<S: Simd>(&mut self, simd: S, model: &HeadModel, width: usize) {
+        let unit = Unit::detect();
+        let Self { batches, shares, activations, rendered, gradient, .. } = self;
+        for (s, batch) in batches.iter_mut().enumerate() {
+            gradient[s].clear();
+            gradient[s].resize(model.heads.weights[s].len(), 0.0);
+            let Some((net, packed)) = model.net(s).filter(|_| !batch.is_empty()) else { continue };
+            let StreamBatch { sample, levels, .. } = batch;
+            let activations = &mut activations[s];
+            for (n, (rays, shares)) in sample.chunks(TILE).zip(shares[s].chunks(TILE)).enumerate() {
+                let out = activations.output_grad(n);
+                out.fill(0.0);
+                for (lane, (ray, share)) in rays.iter().zip(shares).enumerate() {
+                    let g = &rendered[*ray as usize * width..][..width];
+                    for (k, g) in g.iter().enumerate() {
+                        out[k * TILE + lane] = share * g;
+                    }
+                }
+                net.mlp.backward(simd, &unit, packed, activations, n);
+                let input = activations.input_grad(n);
+                for (level, g) in levels.iter_mut().zip(input.chunks_exact(FEATURES * TILE)) {
+                    level.write_tile(n, g);
+                }
+            }
+            let tiles = sample.len().div_ceil(TILE);
+            net.mlp.accumulate(simd, &unit, packed, activations, tiles, &mut gradient[s]);
+        }
+    }
+}
+
+/// Scatters one level's gradients and updates its table.
+struct TablePass<'a> {
+    groups: &'a [Group],
+    stream: usize,
+    number: usize,
+    level: &'a Level,
+    table: &'a mut [Row],
+    state: &'a mut TableState,
+    rate: StepSize,
+}
+
+impl WithSimd for TablePass<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let Self { groups, stream, number, level, table, state, rate } = self;
+        for batch in groups.iter().map(|g| &g.batches[stream]).filter(|b| !b.is_empty()) {
+            let rows = &batch.levels[number].rows[..batch.len()];
+            for (pos, g) in batch.tiles().iter().zip(rows.chunks(TILE)) {
+                level.scatter(&mut state.grad, pos, g);
+            }
+        }
+        state.update(table, rate);
+    }
+}
