@@ -11,6 +11,9 @@ step() {
 step "tools that read our files"
 tests/tools/setup.sh
 
+step "PyTorch's text encoders, to compare ours with"
+tests/tools/setup_text.sh
+
 step "format"
 cargo fmt --all --check
 
@@ -22,6 +25,9 @@ RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps --locked --release
 
 step "tests, release"
 cargo test --workspace --locked --release
+
+step "a build without text encoders"
+cargo clippy --package divff --lib --no-default-features --locked --release -- -D warnings
 
 step "tests of the file formats, with overflow checks and debug assertions"
 cargo test --package divff-exporters --locked

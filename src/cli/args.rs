@@ -236,6 +236,9 @@ pub struct TextArgs {
     /// Embeddings of the phrases, one row for each --text in order, of shape [Q, D] or [D]
     #[arg(long, value_name = "F.npy", requires = "text")]
     pub text_embedding: Option<PathBuf>,
+    /// Text encoder for phrases without an embedding (scripts/export_text_encoders.py makes one)
+    #[arg(long, value_name = "DIR", requires = "text")]
+    pub text_encoder: Option<PathBuf>,
     /// Temperature of the relevancy [default: that of the run]
     #[arg(long, value_name = "TAU")]
     pub temperature: Option<f32>,

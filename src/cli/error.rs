@@ -134,9 +134,8 @@ fn is_input(error: &PipelineError) -> bool {
                 | SemanticsError::Scene(_)
                 | SemanticsError::Compress(_)
                 | SemanticsError::Relevancy(_)
-                | SemanticsError::Phrase { .. }
+                | SemanticsError::Text(_)
                 | SemanticsError::NoFeatures { .. }
-                | SemanticsError::EmbeddingCount { .. }
                 | SemanticsError::Stored { .. }
         ),
         E::Eval(error) => !matches!(**error, EvalError::NonFinite { .. } | EvalError::Render { .. }),

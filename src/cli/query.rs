@@ -13,7 +13,7 @@ use divff::semantics::config::SemanticsConfig;
 use divff::semantics::layers::FeatureLayers;
 use divff::semantics::overlay::overlay;
 use divff::semantics::relevancy::{Points, Queries};
-use divff::semantics::{SemanticFields, SemanticsError, TextSource, slug};
+use divff::semantics::{SemanticFields, SemanticsError, TextSources, slug};
 use divff_exporters::npz::read_npz_matrices;
 use divff_exporters::{
     Attribute, AttributeValues, Geometry, GlbOptions, Manifest, PlyOptions, UpAxis, read_glb, read_ply,
@@ -35,10 +35,13 @@ impl From<SpaceArg> for Space {
 }
 
 /// Embeddings of the phrases asked for.
-pub fn text_source(args: &TextArgs, scene: &Scene) -> Result<TextSource, CliError> {
-    let mut text = TextSource::of_scene(scene)?;
+pub fn text_source(args: &TextArgs, scene: &Scene) -> Result<TextSources, CliError> {
+    let mut text = TextSources::of_scene(scene)?;
     if let Some(path) = &args.text_embedding {
         text.give(args.space.into(), &args.text, path)?;
+    }
+    if let Some(folder) = &args.text_encoder {
+        text.encode_with(args.space.into(), folder)?;
     }
     Ok(text)
 }
@@ -71,7 +74,7 @@ pub fn feature_layers<'a>(
         _ => {}
     }
     let mut layers = FeatureLayers::new(&config.semantics);
-    let text = if scores { text_source(&args.text, scene)? } else { TextSource::default() };
+    let text = if scores { text_source(&args.text, scene)? } else { TextSources::default() };
     let temperature = args.text.temperature.unwrap_or(config.semantics.temperature);
     for (space, layer) in [(Space::Clip, LayerArg::Clip), (Space::Egovideo, LayerArg::Egovideo)] {
         let scores = scores && Space::from(args.text.space) == space;
@@ -112,8 +115,8 @@ pub fn query(args: &QueryArgs) -> Result<(), CliError> {
     let Asked { mut geometries, glb, folder } = asked(&args.path)?;
     let space = Space::from(args.text.space);
     let mut text = match embeddings_folder(args)? {
-        Some(root) => TextSource::of_folder(&root)?,
-        None => TextSource::default(),
+        Some(root) => TextSources::of_folder(&root)?,
+        None => TextSources::default(),
     };
     if let Some(path) = &args.text.text_embedding {
         text.give(space, &args.text.text, path)?;

@@ -15,7 +15,7 @@ use crate::scene::{Frame, Scene, Split};
 use crate::semantics::agreement::feature_cosines;
 use crate::semantics::head::train;
 use crate::semantics::layers::FeatureLayers;
-use crate::semantics::{SemanticFields, SemanticsError, TextSource};
+use crate::semantics::{SemanticFields, SemanticsError, TextSources};
 use crate::train::Trained;
 
 /// Trains the fields of features at the geometry of `trained` and stores them; those of an earlier call with the same
@@ -83,7 +83,7 @@ impl<'a> SemanticEvaluation<'a> {
         let mut layers = FeatureLayers::new(&config.semantics);
         let mut why = [None, None];
         let fields = fields.filter(|f| !f.is_empty());
-        let text = if fields.is_some() { TextSource::of_scene(scene)? } else { TextSource::default() };
+        let text = if fields.is_some() { TextSources::of_scene(scene)? } else { TextSources::default() };
         for space in Space::ALL {
             let asked = truth.phrases(space);
             let known = |p: &String| text.embedding(space, p).is_ok();

@@ -10,7 +10,7 @@ use super::error::SemanticsError;
 use super::fields::{SemanticFields, SpaceField};
 use super::head::HeadModel;
 use super::relevancy::{Points, Queries};
-use super::text_source::{TextSource, slug};
+use super::text_source::{TextSources, slug};
 use crate::field::Stream;
 use crate::field::mlp::Precision;
 use crate::map::{MapFeatures, SemanticMap, Skipped};
@@ -44,7 +44,7 @@ pub fn annotate(
     fields: &SemanticFields,
     config: &SemanticsConfig,
 ) -> Result<(), SemanticsError> {
-    let text = TextSource::of_scene(scene)?;
+    let text = TextSources::of_scene(scene)?;
     let place = Place { trained, model: Model::new(&trained.field, &trained.grids, [true; 3]) };
     for space in Space::ALL {
         let Some(field) = &fields.spaces[space as usize] else {
@@ -85,7 +85,7 @@ impl<'a> Columns<'a> {
     fn new(
         map: &mut SemanticMap,
         field: &'a SpaceField,
-        text: &TextSource,
+        text: &TextSources,
         config: &SemanticsConfig,
     ) -> Result<Self, SemanticsError> {
         let space = field.space;

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use super::compress::CompressError;
 use super::relevancy::RelevancyError;
+use super::text::TextError;
 use crate::scene::SceneError;
 use crate::scene::features::{FeatureError, Space};
 
@@ -23,18 +24,9 @@ pub enum SemanticsError {
     /// Points cannot be held against phrases.
     #[error(transparent)]
     Relevancy(#[from] RelevancyError),
-    /// There is no embedding of a phrase.
-    #[error(
-        "`{phrase}`: no embedding of it in the {} space; add it to text/{}.txt and .npy of the scene, or give one with \
-         --text-embedding",
-        space.name(), space.name()
-    )]
-    Phrase {
-        /// The phrase.
-        phrase: String,
-        /// The space.
-        space: Space,
-    },
+    /// A phrase cannot be embedded.
+    #[error(transparent)]
+    Text(Box<TextError>),
     /// The run has no features of a space.
     #[error("{} features: {why}; train the run on a scene that has them", space.name())]
     NoFeatures {
@@ -42,16 +34,6 @@ pub enum SemanticsError {
         space: Space,
         /// Why there are none.
         why: String,
-    },
-    /// Embeddings and phrases do not fit together.
-    #[error("{}: it has {rows} embeddings for {phrases} phrases; give one row for each --text, in order", path.display())]
-    EmbeddingCount {
-        /// The file.
-        path: PathBuf,
-        /// Its rows.
-        rows: usize,
-        /// Phrases asked for.
-        phrases: usize,
     },
     /// A file of trained features is damaged, or of another version.
     #[error("{}: {what}; {remedy}", path.display())]
@@ -80,6 +62,12 @@ pub enum SemanticsError {
 impl From<FeatureError> for SemanticsError {
     fn from(error: FeatureError) -> Self {
         Self::Feature(Box::new(error))
+    }
+}
+
+impl From<TextError> for SemanticsError {
+    fn from(error: TextError) -> Self {
+        Self::Text(Box::new(error))
     }
 }
 

@@ -12,7 +12,7 @@ use super::config::SemanticsConfig;
 use super::error::SemanticsError;
 use super::head::{HeadShape, Heads};
 use super::relevancy::Queries;
-use super::text_source::TextSource;
+use super::text_source::TextSources;
 use crate::field::Stream;
 use crate::field::hashgrid::Row;
 use crate::scene::features::Space;
@@ -79,11 +79,11 @@ impl SpaceField {
     /// Phrases ready to be held against this space's features.
     ///
     /// # Errors
-    /// [`SemanticsError::Phrase`] where no source knows a phrase, [`SemanticsError::Relevancy`] for embeddings that do
+    /// [`crate::semantics::text::TextError::Phrase`] where no source knows a phrase, [`SemanticsError::Relevancy`] for embeddings that do
     /// not fit.
     pub fn queries(
         &self,
-        text: &TextSource,
+        text: &TextSources,
         phrases: &[String],
         temperature: f32,
     ) -> Result<Queries, SemanticsError> {

@@ -8,7 +8,7 @@ use super::error::SemanticsError;
 use super::fields::{SemanticFields, SpaceField};
 use super::head::{FeatureImage, HeadModel, render_features, trace_frame};
 use super::relevancy::{Points, Queries};
-use super::text_source::{TextSource, slug};
+use super::text_source::{TextSources, slug};
 use crate::field::mlp::Precision;
 use crate::render::forward::Model;
 use crate::render::sampler::Sampling;
@@ -58,7 +58,7 @@ impl<'a> FeatureLayers<'a> {
         space: Space,
         features: bool,
         phrases: &[String],
-        text: &TextSource,
+        text: &TextSources,
         temperature: f32,
     ) -> Result<(), SemanticsError> {
         let field = fields.space(space)?;

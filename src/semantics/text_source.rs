@@ -5,34 +5,40 @@ use std::path::Path;
 use super::compress::Compressor;
 use super::error::SemanticsError;
 use super::relevancy::Queries;
+use super::text::{TextError, TextSource};
 use crate::scene::Scene;
-use crate::scene::features::{FeatureStore, Space, TextTable, read_embeddings};
+use crate::scene::features::{FeatureStore, Space};
 
-/// Embeddings of phrases: those that come with a scene, and those given for single phrases.
-#[derive(Clone, Debug, Default)]
-pub struct TextSource {
-    tables: [Option<TextTable>; 2],
-    given: Vec<(Space, String, Vec<f32>)>,
+/// What can embed phrases in either space: what is given, what comes with a scene, and encoders.
+#[derive(Debug)]
+pub struct TextSources {
+    spaces: [TextSource; 2],
 }
 
-impl TextSource {
-    /// What `text/` in a folder holds.
+impl TextSources {
+    /// What `text/` in a folder holds, and the encoders that the environment names.
     ///
     /// # Errors
-    /// A file of embeddings that is damaged.
+    /// A file of embeddings that is damaged, or an encoder that is not where it should be.
     pub fn of_folder(root: &Path) -> Result<Self, SemanticsError> {
-        let [clip, egovideo] = Space::ALL.map(|space| TextTable::read(root, space));
-        Ok(Self { tables: [clip?, egovideo?], given: Vec::new() })
+        Self::new(Space::ALL.map(|space| TextSource::of_folder(root, space)))
     }
 
     /// As [`Self::of_folder`], checked against the scene's features.
     ///
     /// # Errors
-    /// A file of embeddings that is damaged or does not fit the features.
+    /// Also embeddings that do not fit the features.
     pub fn of_scene(scene: &Scene) -> Result<Self, SemanticsError> {
         let store = FeatureStore::open(scene)?;
-        let [clip, egovideo] = Space::ALL.map(|space| store.text(space));
-        Ok(Self { tables: [clip?, egovideo?], given: Vec::new() })
+        Self::new(Space::ALL.map(|space| TextSource::of_scene(&store, space)))
+    }
+
+    fn new([clip, egovideo]: [Result<TextSource, TextError>; 2]) -> Result<Self, SemanticsError> {
+        let mut spaces = [clip?, egovideo?];
+        for source in &mut spaces {
+            source.find_encoder(None)?;
+        }
+        Ok(Self { spaces })
     }
 
     /// Adds a file with one embedding for each of `phrases`, in order; they win over the scene's.
@@ -40,28 +46,29 @@ impl TextSource {
     /// # Errors
     /// A file that cannot be used, or with another number of rows.
     pub fn give(&mut self, space: Space, phrases: &[String], path: &Path) -> Result<(), SemanticsError> {
-        let rows = read_embeddings(path)?;
-        if rows.rows() != phrases.len() {
-            let (path, phrases) = (path.to_owned(), phrases.len());
-            return Err(SemanticsError::EmbeddingCount { path, rows: rows.rows(), phrases });
-        }
-        let given = phrases.iter().enumerate().map(|(n, p)| (space, p.clone(), rows.row(n).to_vec()));
-        self.given.extend(given);
-        Ok(())
+        Ok(self.spaces[space as usize].add_file(phrases, path)?)
+    }
+
+    /// Takes the text encoder in `folder` (or in its `clip` or `egovideo`) for phrases that nothing else knows.
+    ///
+    /// # Errors
+    /// There is none, or its embeddings do not fit the scene's features.
+    pub fn encode_with(&mut self, space: Space, folder: &Path) -> Result<(), SemanticsError> {
+        Ok(self.spaces[space as usize].find_encoder(Some(folder))?)
     }
 
     /// The embedding of a phrase, from the first source that knows it.
     ///
     /// # Errors
-    /// [`SemanticsError::Phrase`] if none does.
+    /// [`TextError::Phrase`] if none does.
     pub fn embedding(&self, space: Space, phrase: &str) -> Result<Vec<f32>, SemanticsError> {
-        self.known(space, phrase).ok_or_else(|| SemanticsError::Phrase { phrase: phrase.to_owned(), space })
+        Ok(self.spaces[space as usize].embed(phrase)?)
     }
 
     /// Phrases ready to be held against features that `compressor` made short.
     ///
     /// # Errors
-    /// [`SemanticsError::Phrase`] where no source knows a phrase, [`SemanticsError::Relevancy`] for embeddings that do
+    /// [`TextError::Phrase`] where no source knows a phrase, [`SemanticsError::Relevancy`] for embeddings that do
     /// not fit, or if no canonical phrase is known.
     pub fn queries(
         &self,
@@ -80,20 +87,14 @@ impl TextSource {
 
     /// Embeddings of the canonical phrases that are known.
     pub fn canonical(&self, space: Space) -> Vec<Vec<f32>> {
-        space.canonical_phrases().iter().filter_map(|p| self.known(space, p)).collect()
+        space.canonical_phrases().iter().filter_map(|p| self.embedding(space, p).ok()).collect()
     }
 
-    /// The first `most` phrases that come with the scene, canonical ones aside.
+    /// The first `most` phrases that have an embedding without an encoder, canonical ones aside.
     pub fn phrases(&self, space: Space, most: usize) -> Vec<String> {
-        let all = self.tables[space as usize].iter().flat_map(|t| &t.phrases);
         let canonical = space.canonical_phrases();
-        let asked = all.filter(|p| !canonical.contains(&p.as_str()) && !p.is_empty());
-        asked.take(most).cloned().collect()
-    }
-
-    fn known(&self, space: Space, phrase: &str) -> Option<Vec<f32>> {
-        let given = self.given.iter().find(|(s, p, _)| *s == space && p == phrase).map(|g| g.2.clone());
-        given.or_else(|| Some(self.tables[space as usize].as_ref()?.find(phrase)?.to_vec()))
+        let asked = self.spaces[space as usize].phrases().filter(|p| !canonical.contains(p) && !p.is_empty());
+        asked.take(most).map(str::to_owned).collect()
     }
 }
 

@@ -106,19 +106,6 @@ pub enum FeatureError {
         /// Rows of it.
         rows: usize,
     },
-    /// A phrase has no embedding.
-    #[error(
-        "no {space} embedding of \"{phrase}\": {searched}; add the phrase and its embedding to text/{space}.txt and \
-         text/{space}.npy, give a .npy file (--text-embedding), or a text encoder"
-    )]
-    Phrase {
-        /// The phrase.
-        phrase: String,
-        /// Name of the space.
-        space: &'static str,
-        /// Where it was looked for.
-        searched: String,
-    },
 }
 
 impl FeatureError {
