@@ -74,7 +74,7 @@ pub fn feature_layers<'a>(
         _ => {}
     }
     let mut layers = FeatureLayers::new(&config.semantics);
-    let text = if scores { text_source(&args.text, scene)? } else { TextSources::default() };
+    let text = if scores { text_source(&args.text, scene)? } else { TextSources::encoders()? };
     let temperature = args.text.temperature.unwrap_or(config.semantics.temperature);
     for (space, layer) in [(Space::Clip, LayerArg::Clip), (Space::Egovideo, LayerArg::Egovideo)] {
         let scores = scores && Space::from(args.text.space) == space;
@@ -116,10 +116,13 @@ pub fn query(args: &QueryArgs) -> Result<(), CliError> {
     let space = Space::from(args.text.space);
     let mut text = match embeddings_folder(args)? {
         Some(root) => TextSources::of_folder(&root)?,
-        None => TextSources::default(),
+        None => TextSources::encoders()?,
     };
     if let Some(path) = &args.text.text_embedding {
         text.give(space, &args.text.text, path)?;
+    }
+    if let Some(folder) = &args.text.text_encoder {
+        text.encode_with(space, folder)?;
     }
     let name = format!("{}_pca", space.name());
     let compressor = compressor(&folder, &name)?;

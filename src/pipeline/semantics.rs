@@ -83,7 +83,7 @@ impl<'a> SemanticEvaluation<'a> {
         let mut layers = FeatureLayers::new(&config.semantics);
         let mut why = [None, None];
         let fields = fields.filter(|f| !f.is_empty());
-        let text = if fields.is_some() { TextSources::of_scene(scene)? } else { TextSources::default() };
+        let text = if fields.is_some() { TextSources::of_scene(scene)? } else { TextSources::encoders()? };
         for space in Space::ALL {
             let asked = truth.phrases(space);
             let known = |p: &String| text.embedding(space, p).is_ok();

@@ -22,4 +22,4 @@ pub mod text_source;
 pub use self::config::SemanticsConfig;
 pub use self::error::SemanticsError;
 pub use self::fields::{SemanticFields, SpaceField};
-pub use self::text_source::{TextSourcess, slug};
+pub use self::text_source::{TextSources, slug};

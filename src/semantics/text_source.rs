@@ -16,6 +16,14 @@ pub struct TextSources {
 }
 
 impl TextSources {
+    /// The encoders that the environment names, and nothing else.
+    ///
+    /// # Errors
+    /// An encoder that is not where it should be.
+    pub fn encoders() -> Result<Self, SemanticsError> {
+        Self::new(Space::ALL.map(|space| Ok(TextSource::new(space, None))))
+    }
+
     /// What `text/` in a folder holds, and the encoders that the environment names.
     ///
     /// # Errors
