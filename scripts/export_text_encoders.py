@@ -130,7 +130,7 @@ def export(module, tokenizer, out, space, name, context, pad):
     with torch.no_grad():
         dim = module(*example).shape[-1]
         path = f"{out}/model.onnx"
-        torch.onnx.export(module, example, path, input_names=module.inputs, output_names=["embedding"],
+        torch.onnx.export(module, example, path, input_names=module.inputs, output_names=["text_embedding"],
                           opset_version=18, dynamo=True, external_data=False, verbose=False)
     tokenizer.save(f"{out}/tokenizer.json")
     about = dict(space=space, model=name, context=context, pad=pad, dim=dim)

@@ -42,8 +42,8 @@ impl TextEncoder {
         let node = |name: &str| model.find_node(name);
         let ids = node("input_ids").ok_or_else(|| bad("model.onnx", "it has no input `input_ids`".into()))?;
         let mask = node("attention_mask");
-        let output =
-            node("embedding").ok_or_else(|| bad("model.onnx", "it has no output `embedding`".into()))?;
+        let output = node("text_embedding")
+            .ok_or_else(|| bad("model.onnx", "it has no output `text_embedding`".into()))?;
         Ok(Self { folder: folder.to_owned(), about, tokenizer, model, ids, mask, output })
     }
 
