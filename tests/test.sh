@@ -3,6 +3,10 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
+# Optimised as in a release, but not across crates: every test program would be optimised whole once more, half an hour
+# in all.
+export CARGO_PROFILE_RELEASE_LTO=off
+
 step() {
     echo
     echo "== $*"
