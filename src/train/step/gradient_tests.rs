@@ -102,7 +102,7 @@ fn trace_with(seed: u64, precision: Precision) -> Traced {
         transient: 1.0,
         distortion: 10.0,
         entropy: 5.0,
-        flatness: 50.0,
+        flatness: 12.0,
         exposure: 100.0,
         ..config.loss
     };
@@ -392,7 +392,7 @@ fn bf16_gradients_agree_with_f32_ones() {
             let size = norm(&mut a.iter().copied());
             let error = norm(&mut a.iter().zip(b).map(|(a, b)| a - b));
             let camera = range.start >= exact.field.layout.exposure.start;
-            let bound = if matches!(place, Place::Weights) && camera { 0.7 } else { 0.15 };
+            let bound = if matches!(place, Place::Weights) && camera { 0.9 } else { 0.3 };
             assert!(error < bound * size, "seed {seed}, {name}: off by {error:e} of {size:e}");
         }
     }
