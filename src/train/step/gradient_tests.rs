@@ -45,7 +45,19 @@ enum Place {
 
 /// Traces one chunk of a field whose numbers are all random, with holes in its density grids.
 fn trace(seed: u64) -> Traced {
-    trace_with(seed, Precision::F32)
+    trace_with(seed, Precision::F32, weighed())
+}
+
+/// Weights large enough that one per cent of a term is more than the tolerance.
+fn weighed() -> LossConfig {
+    LossConfig {
+        transient: 1.0,
+        distortion: 10.0,
+        entropy: 5.0,
+        flatness: 12.0,
+        exposure: 100.0,
+        ..LossConfig::default()
+    }
 }
 
 /// Seeds whose chunk looks at every frame, and along an even row.
@@ -59,11 +71,11 @@ fn seeds() -> impl Iterator<Item = u64> {
     (1..).filter(sees_all)
 }
 
-fn trace_with(seed: u64, precision: Precision) -> Traced {
+fn trace_with(seed: u64, precision: Precision, config: LossConfig) -> Traced {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let mut pixels = PixelSet::load(testing::frames(folder.path())).expect("frames that were just written");
-    let config = testing::config();
-    let mut field = Field::zeros(testing::shape(&config));
+    let settings = testing::config();
+    let mut field = Field::zeros(testing::shape(&settings));
     field.init(seed);
     let mut rng = Rng::new(seed, 1, 0);
     for row in field.tables.iter_mut().flatten().flatten() {
@@ -85,27 +97,18 @@ fn trace_with(seed: u64, precision: Precision) -> Traced {
     shake(layout.rig.clone(), 0.01);
     // In the middle of the box, so that rays end in front of it, within its error and behind it.
     pixels.stereo = pixels.frames.iter().map(|f| StereoDepth::flat(&f.camera, 0.3)).collect();
-    let mut grids = Grids::new(&field, config.train.grid_cells);
+    let mut grids = Grids::new(&field, settings.train.grid_cells);
     for sigma in grids.streams.iter_mut().flat_map(|g| &mut g.sigma) {
         *sigma = if rng.uniform() < 0.2 { 0.0 } else { 0.1 + 4.0 * rng.uniform() };
     }
     grids.threshold = [0.05; 3];
     // Every fourth chunk refines poses: the first one does at a step that is a multiple of four.
-    let mut plan = config.train.plan(4, 0.5, [true; 3]);
+    let mut plan = settings.train.plan(4, 0.5, [true; 3]);
     plan.precision = precision;
     // Patches that have rows of three, and as many of them as fit into a chunk.
     plan.patch = 3;
     plan.pose_rate = 1.0;
     plan.rig_rate = 1.0;
-    // Large enough that one per cent of a term is more than the tolerance.
-    let config = LossConfig {
-        transient: 1.0,
-        distortion: 10.0,
-        entropy: 5.0,
-        flatness: 12.0,
-        exposure: 100.0,
-        ..config.loss
-    };
     let (chunk, dense, tables) = (TrainChunk::default(), vec![0.0; layout.len], Default::default());
     let mut traced = Traced { field, pixels, config, plan, chunk, loss: 0.0, dense, tables };
     traced.run(&grids, seed);
@@ -384,7 +387,9 @@ fn a_term_that_is_off_by_one_per_cent_is_found() {
 #[test]
 fn bf16_gradients_agree_with_f32_ones() {
     for seed in seeds().take(3) {
-        let (exact, rounded) = (trace(seed), trace_with(seed, Precision::Bf16));
+        // Bends are differences of rounded numbers: at the weight that training gives them.
+        let config = LossConfig { flatness: LossConfig::default().flatness, transient: 0.1, ..weighed() };
+        let [exact, rounded] = [Precision::F32, Precision::Bf16].map(|p| trace_with(seed, p, config.clone()));
         assert!((exact.loss - rounded.loss).abs() < 1e-2 * exact.loss.abs());
         for (name, place, range) in exact.groups() {
             let (a, b) = (exact.gradient(place, range.clone()), rounded.gradient(place, range.clone()));
@@ -392,7 +397,7 @@ fn bf16_gradients_agree_with_f32_ones() {
             let size = norm(&mut a.iter().copied());
             let error = norm(&mut a.iter().zip(b).map(|(a, b)| a - b));
             let camera = range.start >= exact.field.layout.exposure.start;
-            let bound = if matches!(place, Place::Weights) && camera { 0.9 } else { 0.3 };
+            let bound = if matches!(place, Place::Weights) && camera { 0.5 } else { 0.15 };
             assert!(error < bound * size, "seed {seed}, {name}: off by {error:e} of {size:e}");
         }
     }
