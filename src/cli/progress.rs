@@ -108,10 +108,7 @@ impl Observer for Reporter {
             }
             Event::Training(progress) => self.training(progress),
             Event::Features(p) => {
-                let inside = p.step as f64 / p.steps.max(1) as f64;
-                self.advance(0.5 * (p.space as usize as f64 + inside), || {
-                    format!("{}: step {}, loss {:.4}", p.space.name(), p.step, p.loss)
-                });
+                self.advance(p.fraction, || format!("{}: step {}, loss {:.4}", p.what, p.step, p.loss));
             }
             Event::Mapping(p) => {
                 // Stages differ in length; each counts as one part of the bar.

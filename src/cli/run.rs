@@ -46,7 +46,7 @@ pub fn train(args: &RunArgs, stop: StopFlag) -> Result<(), CliError> {
     let trained = pipeline::train(&scene, &config, &run, args.fresh, &mut reporter)?;
     let progress = trained.progress.clone();
     let finished = progress.finished
-        && pipeline::train_features(&scene, &trained, &config, &run, &mut reporter)?.is_some();
+        && pipeline::train_features(&scene, trained, &config, &run, &mut reporter)?.is_some();
     drop(reporter);
     if !finished {
         return Err(CliError::Stopped { step: progress.step });

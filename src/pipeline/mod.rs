@@ -140,7 +140,9 @@ pub fn run(
     if !trained.progress.finished {
         return Ok(stopped);
     }
-    let Some(fields) = train_features(scene, &trained, config, &run, observer)? else { return Ok(stopped) };
+    let Some((fields, trained)) = train_features(scene, trained, config, &run, observer)? else {
+        return Ok(stopped);
+    };
     cost.feature_seconds = Some(fields.seconds);
     let map = run.map();
     let manifest =

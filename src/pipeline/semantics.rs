@@ -18,37 +18,41 @@ use crate::semantics::layers::FeatureLayers;
 use crate::semantics::{SemanticFields, SemanticsError, TextSources};
 use crate::train::Trained;
 
-/// Trains the fields of features at the geometry of `trained` and stores them; those of an earlier call with the same
-/// geometry and settings are taken as they are. `None` if the observer said stop.
+/// Trains the fields of features on the geometry of `trained` and stores them, and the geometry where it was trained
+/// with them; those of an earlier call with the same geometry and settings are taken as they are. `None` if the observer
+/// said stop.
 ///
 /// # Errors
 /// Features that cannot be used, or a file that cannot be written.
 pub fn train_features(
     scene: &Scene,
-    trained: &Trained,
+    trained: Trained,
     config: &Config,
     run: &RunFolder,
     observer: &mut dyn Observer,
-) -> Result<Option<SemanticFields>, PipelineError> {
+) -> Result<Option<(SemanticFields, Trained)>, PipelineError> {
     match SemanticFields::load(run.root()) {
-        Ok(Some(fields)) if fields.fits(trained, &config.semantics) => return Ok(Some(fields)),
+        Ok(Some(fields)) if fields.fits(&trained, &config.semantics) => return Ok(Some((fields, trained))),
         // Damaged or of another version: what is derived is made again.
         Ok(_) | Err(SemanticsError::Stored { .. }) => {}
         Err(error) => return Err(error.into()),
     }
     observer.event(&Event::Stage(Stage::Features));
     let start = Instant::now();
-    let fields = train::train_features(scene, trained, config, &mut |progress| {
+    let found = train::train_features(scene, &trained, config, run.root(), &mut |progress| {
         observer.event(&Event::Features(progress));
         if observer.stop() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     })?;
-    let Some(mut fields) = fields else { return Ok(None) };
+    let Some((mut fields, trainer)) = found else { return Ok(None) };
     for warning in &fields.warnings {
         tracing::warn!("{warning}");
     }
     fields.seconds = start.elapsed().as_secs_f64();
     fields.save(run.root())?;
-    Ok(Some(fields))
+    let Some(trainer) = trainer else { return Ok(Some((fields, trained))) };
+    // After the features: a run that is stopped between the two has features of no geometry, and makes both again.
+    trainer.save(run.root())?;
+    Ok(Some((fields, trainer.into_trained())))
 }
 
 /// The fields of features of a run; `None` if none were trained, or on another geometry.

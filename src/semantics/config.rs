@@ -58,6 +58,10 @@ pub struct SemanticsConfig {
     pub layers: usize,
     /// Training steps of each space, at frozen geometry.
     pub steps: u64,
+    /// Steps after that in which geometry is trained with them; 0: it stays as it was.
+    pub joint_steps: u64,
+    /// Weight of the features' loss where it pulls at geometry then.
+    pub joint_weight: f32,
     /// Rays a step.
     pub rays: usize,
     /// Rays that are traced once and kept, over all frames.
@@ -105,6 +109,8 @@ impl Default for SemanticsConfig {
             hidden: 64,
             layers: 1,
             steps: 1500,
+            joint_steps: 100,
+            joint_weight: 1.0,
             rays: 4096,
             cached_rays: 800_000,
             samples: 8,
@@ -142,6 +148,8 @@ impl SemanticsConfig {
         range("semantics.hidden", h.to_string(), (4..=512).contains(&h), "must be 4 to 512")?;
         let l = self.layers;
         range("semantics.layers", l.to_string(), (1..=8).contains(&l), "must be 1 to 8")?;
+        let j = self.joint_weight;
+        range("semantics.joint_weight", j.to_string(), (0.0..=1e3).contains(&j), "must be 0 to 1000")?;
         range("semantics.steps", self.steps.to_string(), self.steps > 0, "must be at least 1")?;
         let n = self.rays;
         range("semantics.rays", n.to_string(), (1..=1 << 20).contains(&n), "must be 1 to 1048576")?;

@@ -7,6 +7,7 @@ use super::relevancy::RelevancyError;
 use super::text::TextError;
 use crate::scene::SceneError;
 use crate::scene::features::{FeatureError, Space};
+use crate::train::TrainError;
 
 /// Why features cannot be trained, stored or asked.
 #[derive(Debug, thiserror::Error)]
@@ -18,6 +19,9 @@ pub enum SemanticsError {
     /// A frame cannot be read.
     #[error(transparent)]
     Scene(Box<SceneError>),
+    /// Geometry cannot be trained with the features.
+    #[error(transparent)]
+    Train(Box<TrainError>),
     /// Descriptors cannot be compressed.
     #[error("descriptors cannot be compressed: {0}")]
     Compress(#[from] CompressError),
@@ -74,5 +78,11 @@ impl From<TextError> for SemanticsError {
 impl From<SceneError> for SemanticsError {
     fn from(error: SceneError) -> Self {
         Self::Scene(Box::new(error))
+    }
+}
+
+impl From<TrainError> for SemanticsError {
+    fn from(error: TrainError) -> Self {
+        Self::Train(Box::new(error))
     }
 }

@@ -99,6 +99,11 @@ impl SemanticFields {
         Self { spaces, skipped, warnings, config, seconds: 0.0, geometry }
     }
 
+    /// Notes that the geometry of `trained` is the one that they were trained on.
+    pub fn belongs_to(&mut self, trained: &Trained) {
+        self.geometry = geometry_id(trained);
+    }
+
     /// Notes that something was left out.
     pub fn skip(&mut self, what: &str, why: &str) {
         self.skipped.push((what.to_owned(), why.to_owned()));

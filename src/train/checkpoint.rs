@@ -53,6 +53,9 @@ pub struct TrainingState {
     pub stereo_from: Option<Vec<f32>>,
     /// How many of the due alignments of the frames are done.
     pub aligned: usize,
+    /// Steps after the end of the schedule, together with fields of features.
+    #[serde(default)]
+    pub joint: u64,
 }
 
 #[derive(Serialize, Deserialize)]

@@ -72,6 +72,8 @@ pub struct ChunkGradient {
     pub samples: [StreamSamples; 3],
     /// With respect to the six exposure numbers of each ray.
     pub exposure: Vec<[f32; 6]>,
+    /// What other losses ask of w^s, set before; empty: nothing.
+    pub asked: Vec<[f32; 3]>,
     /// With respect to the disparity of each ray.
     disparity: Vec<f32>,
 }
@@ -138,7 +140,7 @@ pub fn backward(
             for s in 0..3 {
                 let w = chunk.weighted[k].weight[s];
                 let rgb = chunk.samples[s].rgb[k];
-                let mut g = 0.0;
+                let mut g = grad.asked.get(k).map_or(0.0, |asked| asked[s]);
                 for c in 0..3 {
                     g += d_rgb[c] * rgb[c];
                     grad.samples[s].rgb[k][c] = d_rgb[c] * w;

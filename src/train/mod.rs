@@ -10,7 +10,7 @@ pub mod pixels;
 mod schedule;
 pub mod step;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod trainer;
 
 pub use self::checkpoint::Trained;

@@ -17,7 +17,7 @@ use super::pixels::PixelSet;
 use crate::field::Field;
 use crate::field::mlp::Precision;
 use crate::field::stream::LevelTask;
-use crate::render::forward::{Grids, Model};
+use crate::render::forward::{Chunk, Grids, Model};
 use crate::render::rays::View;
 use crate::render::sampler::Sampling;
 
@@ -61,6 +61,20 @@ pub struct StepPlan {
     pub streams: [bool; 3],
     /// What the networks are multiplied in.
     pub precision: Precision,
+}
+
+/// Another loss that a step minimises beside that of colours, on rays of its own choice.
+pub trait Companion: Sync {
+    /// Frame and pixel of each ray of chunk number `chunk`, [`CHUNK_RAYS`] of them; of usable pixels.
+    fn rays(&self, chunk: usize) -> Vec<(usize, usize)>;
+
+    /// Adds the gradient of its loss with respect to w^s of every sample of a traced chunk to `weight`.
+    fn ask(&self, chunk: usize, traced: &Chunk, weight: &mut [[f32; 3]]);
+}
+
+/// Chunks of a step of `rays` rays.
+pub fn chunks(rays: usize) -> usize {
+    rays.div_ceil(CHUNK_RAYS * GROUPS) * GROUPS
 }
 
 /// What a step did.
@@ -109,7 +123,8 @@ impl Optimiser {
         self.gradient = vec![0.0; field.layout.len];
     }
 
-    /// Runs one step.
+    /// Runs one step, for the colours of random pixels, or for those and another loss of the companion's pixels.
+    #[allow(clippy::too_many_arguments)]
     pub fn step(
         &mut self,
         field: &mut Field,
@@ -118,12 +133,13 @@ impl Optimiser {
         config: &LossConfig,
         plan: &StepPlan,
         seed: u64,
+        companion: Option<&dyn Companion>,
     ) -> StepReport {
-        let chunks = plan.rays.div_ceil(CHUNK_RAYS * GROUPS);
+        let chunks = chunks(plan.rays) / GROUPS;
         let rays = chunks * CHUNK_RAYS * GROUPS;
         let views: Vec<View> = pixels.frames.iter().map(|f| View::new(field, f)).collect();
         let model = Model::with_precision(field, grids, plan.streams, plan.precision);
-        let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays };
+        let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays, companion };
         let arch = pulp::Arch::new();
         self.groups.par_iter_mut().enumerate().for_each(|(n, group)| {
             arch.dispatch(PlacePass { context: &context, group, first_chunk: n * chunks, chunks });

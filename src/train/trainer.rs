@@ -9,7 +9,7 @@ use super::checkpoint::{Trained, TrainingState};
 use super::config::StreamChoice;
 use super::error::TrainError;
 use super::pixels::PixelSet;
-use super::step::{Optimiser, StepReport};
+use super::step::{Companion, Optimiser, StepReport};
 use crate::config::Config;
 use crate::field::{Field, FieldShape, Normalisation};
 use crate::render::forward::{Grids, Model};
@@ -152,8 +152,7 @@ impl Trainer {
             if !self.trained.progress.streams_settled && self.stands(fraction) {
                 self.settle_streams();
             }
-            let stereo_at = self.config.train.stereo_at;
-            if self.pixels.stereo.is_empty() && fraction >= stereo_at && stereo_at < 1.0 {
+            if fraction >= self.config.train.stereo_at {
                 self.look_at_depth();
             }
             let due = self.config.train.align_at.iter().filter(|at| fraction >= **at).count();
@@ -166,7 +165,8 @@ impl Trainer {
             if fraction >= self.config.train.skip_from {
                 self.trained.grids.skip_below(OCCUPIED_ALPHA);
             }
-            let report = self.step(fraction)?;
+            let report = self.step(fraction, None)?;
+            self.count(&report);
             window.add(&report);
             self.trained.progress.seconds = before + start.elapsed().as_secs_f64();
             let fraction = self.fraction(budget);
@@ -196,6 +196,12 @@ impl Trainer {
         })
     }
 
+    /// Makes a field whose schedule is over ready for more steps, which are counted.
+    pub fn go_on(&mut self, steps: u64) {
+        self.look_at_depth();
+        self.trained.progress.joint += steps;
+    }
+
     /// The field as it is now.
     pub fn trained(&self) -> &Trained {
         &self.trained
@@ -214,19 +220,35 @@ impl Trainer {
         }
     }
 
-    fn save(&self, run: &Path) -> Result<(), TrainError> {
+    /// Stores the field and what is needed to go on training it.
+    ///
+    /// # Errors
+    /// A file that cannot be written; an older one is then untouched.
+    pub fn save(&self, run: &Path) -> Result<(), TrainError> {
         self.trained.save(run, self.config.train.grid_cells, Some(&self.optimiser))
     }
 
-    fn step(&mut self, fraction: f64) -> Result<StepReport, TrainError> {
-        let Trained { field, grids, progress } = &mut self.trained;
-        progress.step += 1;
-        let plan = self.config.train.plan(progress.step, fraction, self.streams);
-        let report =
-            self.optimiser.step(field, grids, &self.pixels, &self.config.loss, &plan, self.config.seed);
+    fn count(&mut self, report: &StepReport) {
+        let progress = &mut self.trained.progress;
         progress.rays += report.rays as u64;
         progress.evaluations += report.evaluations as u64;
         progress.candidates += report.candidates as u64;
+    }
+
+    /// Takes one step as at the share `fraction` of the schedule, with the loss of a companion where there is one.
+    ///
+    /// # Errors
+    /// The numbers diverge.
+    pub fn step(
+        &mut self,
+        fraction: f64,
+        companion: Option<&dyn Companion>,
+    ) -> Result<StepReport, TrainError> {
+        let Trained { field, grids, progress } = &mut self.trained;
+        progress.step += 1;
+        let plan = self.config.train.plan(progress.step, fraction, self.streams);
+        let Config { loss, seed, .. } = &self.config;
+        let report = self.optimiser.step(field, grids, &self.pixels, loss, &plan, *seed, companion);
         let non_finite = |stage, index| TrainError::NonFinite { stage, step: progress.step, index };
         if !report.loss.is_finite() {
             return Err(non_finite("the loss", 0));
@@ -247,9 +269,12 @@ impl Trainer {
         tracing::info!(a.frames, a.rotation, a.translation, lens = ?a.lens, "frames aligned");
     }
 
-    /// Finds the depth of the training frames by stereo: from where they are by now, or from where they were when a
+    /// Finds the depth of the training frames by stereo where that was not done yet: from where they are by now, or from where they were when a
     /// training that goes on did so.
     fn look_at_depth(&mut self) {
+        if !self.pixels.stereo.is_empty() || self.config.train.stereo_at >= 1.0 {
+            return;
+        }
         let Trained { field, progress, .. } = &mut self.trained;
         let refinement = field.layout.pose.start..field.layout.rig.end;
         let now = field.weights[refinement.clone()].to_vec();

@@ -43,8 +43,9 @@ fn a_stopped_run_that_goes_on_gives_the_bytes_of_an_uninterrupted_one() {
     assert_eq!((trained.progress.step, trained.progress.finished), (400, true));
     let cost = &mut Cost::default();
     let map = stopped.map();
-    let fields = pipeline::train_features(&scene, &trained, &config, &stopped, &mut ()).unwrap();
-    pipeline::export_map(&scene, &trained, fields.as_ref(), &config, &map, &Format::ALL, cost, &mut ())
+    let (fields, trained) =
+        pipeline::train_features(&scene, trained, &config, &stopped, &mut ()).unwrap().unwrap();
+    pipeline::export_map(&scene, &trained, Some(&fields), &config, &map, &Format::ALL, cost, &mut ())
         .unwrap()
         .unwrap();
     assert_same_files(&map, &run().join("map"));

@@ -38,6 +38,42 @@ impl Source {
     }
 }
 
+/// A sample that a pixel owes light to, before it is known whether it is kept.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Found {
+    /// w^s.
+    pub weight: f32,
+    pub stream: u8,
+    /// Number in its chunk.
+    pub sample: u32,
+    /// Position in the coordinates of the stream.
+    pub place: Vec3,
+}
+
+/// All samples of a traced chunk that give light, ray by ray.
+pub(super) fn find(chunk: &Chunk, found: &mut Vec<Vec<Found>>) {
+    found.resize_with(chunk.rays.len(), Vec::new);
+    found.iter_mut().for_each(Vec::clear);
+    let per_ray = chunk.intervals.len() / chunk.rays.len().max(1);
+    for (s, batch) in chunk.batches.iter().enumerate() {
+        for (k, place) in batch.points() {
+            let weight = chunk.weighted[k].weight[s];
+            if weight > 0.0 {
+                found[k / per_ray].push(Found { weight, stream: s as u8, sample: k as u32, place });
+            }
+        }
+    }
+}
+
+/// Leaves those of a ray's samples that it owes most of its light to, at most `keep` of them; the sum of their weights.
+pub(super) fn select(found: &mut Vec<Found>, keep: usize) -> f32 {
+    let total: f32 = found.iter().map(|f| f.weight).sum();
+    found.sort_by(|a, b| b.weight.total_cmp(&a.weight));
+    found.truncate(keep);
+    found.retain(|f| f.weight >= NEGLIGIBLE * total);
+    found.iter().map(|f| f.weight).sum()
+}
+
 /// The sources of many rays.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Sources {
@@ -78,8 +114,9 @@ impl Sources {
     #[cfg(test)]
     pub(super) fn of_rays(rays: Vec<Vec<(f32, u8, Vec3)>>) -> Self {
         let mut all = Self { first: vec![0], ..Self::default() };
-        for mut found in rays {
-            all.add(1.0, &mut found, usize::MAX);
+        for of_ray in rays {
+            let found = |(weight, stream, place)| Found { weight, stream, sample: 0, place };
+            all.add(1.0, &mut of_ray.into_iter().map(found).collect(), usize::MAX);
         }
         all
     }
@@ -121,20 +158,12 @@ impl WithSimd for TracePass<'_> {
         let Self { model, views, inputs, sampling, keep } = self;
         let (mut chunk, mut tracer) = (Chunk::default(), Tracer::default());
         let mut out = Sources { first: vec![0], ..Sources::default() };
-        let mut found: Vec<Vec<(f32, u8, Vec3)>> = vec![Vec::new(); CHUNK_RAYS];
+        let mut found = Vec::new();
         for inputs in inputs.chunks(CHUNK_RAYS) {
             chunk.densities(simd, &mut tracer, model, views, inputs, sampling);
-            for (s, batch) in chunk.batches.iter().enumerate() {
-                for (k, p) in batch.points() {
-                    let weight = chunk.weighted[k].weight[s];
-                    if weight > 0.0 {
-                        found[k / sampling.count].push((weight, s as u8, p));
-                    }
-                }
-            }
+            find(&chunk, &mut found);
             for (ray, found) in chunk.rays.iter().zip(&mut found) {
                 out.add(1.0 - ray.left, found, keep);
-                found.clear();
             }
         }
         out
@@ -143,17 +172,13 @@ impl WithSimd for TracePass<'_> {
 
 impl Sources {
     /// Adds a ray whose samples have the given weights.
-    fn add(&mut self, opacity: f32, found: &mut Vec<(f32, u8, Vec3)>, keep: usize) {
-        let total: f32 = found.iter().map(|f| f.0).sum();
-        found.sort_by(|a, b| b.0.total_cmp(&a.0));
-        found.truncate(keep);
-        found.retain(|f| f.0 >= NEGLIGIBLE * total);
-        let kept: f32 = found.iter().map(|f| f.0).sum();
+    fn add(&mut self, opacity: f32, found: &mut Vec<Found>, keep: usize) {
+        let kept = select(found, keep);
         let fraction = |v: f32| (v.clamp(0.0, 1.0) * 65535.0 + 0.5) as u16;
-        self.sources.extend(found.iter().map(|(weight, stream, p)| Source {
-            place: p.to_array().map(fraction),
-            share: fraction(weight / kept),
-            stream: *stream,
+        self.sources.extend(found.iter().map(|f| Source {
+            place: f.place.to_array().map(fraction),
+            share: fraction(f.weight / kept),
+            stream: f.stream,
         }));
         self.first.push(self.sources.len() as u32);
         self.opacity.push(opacity.clamp(0.0, 1.0));

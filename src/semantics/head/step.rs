@@ -18,6 +18,10 @@ use crate::simd::TILE;
 use crate::simd::matrix::Unit;
 use crate::train::adam::{self, Moments, StepSize, TableState};
 
+mod joint;
+
+pub use self::joint::JointPlan;
+
 /// Groups that a step is divided into; fixed, so that sums are taken in the same order on any machine.
 const GROUPS: usize = 16;
 
@@ -153,6 +157,7 @@ impl HeadOptimiser {
         targets: &RayTargets,
         plan: &HeadStep,
     ) -> f64 {
+        self.groups.resize_with(GROUPS, Group::default);
         let bags =
             if targets.bags.is_empty() { 0 } else { (plan.rays / plan.bag.max(1)).div_ceil(GROUPS).max(1) };
         let per_group = if bags > 0 { bags * plan.bag.max(1) } else { plan.rays.div_ceil(GROUPS) };
@@ -211,7 +216,7 @@ impl WithSimd for GroupPass<'_> {
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { group, model, sources, targets, count } = self;
         group.place(sources, targets);
-        group.render(simd, model, targets.width);
+        group.render(simd, model, targets.width, |_, _, _| ());
         group.compare(targets, count);
         group.back(simd, model, targets.width);
     }
@@ -264,14 +269,22 @@ impl Group {
         }
     }
 
+    /// Σ w f of every ray; `outputs(stream, tile, rows)` hears what the networks give for the samples.
     #[inline(always)]
-    fn render<S: Simd>(&mut self, simd: S, model: &HeadModel, width: usize) {
+    fn render<S: Simd>(
+        &mut self,
+        simd: S,
+        model: &HeadModel,
+        width: usize,
+        mut outputs: impl FnMut(usize, usize, &[f32]),
+    ) {
         let Self { rays, batches, shares, activations, rendered, .. } = self;
         rendered.clear();
         rendered.resize(rays.len() * width, 0.0);
         for (s, batch) in batches.iter_mut().enumerate().filter(|(_, b)| !b.is_empty()) {
             let rays: Vec<u32> = batch.sample.clone();
             model.forward(simd, s, batch, &mut activations[s], |tile, rows| {
+                outputs(s, tile, rows);
                 let lanes = rays[tile * TILE..].iter().zip(&shares[s][tile * TILE..]).take(TILE);
                 for (lane, (ray, share)) in lanes.enumerate() {
                     let out = &mut rendered[*ray as usize * width..][..width];

@@ -1,11 +1,15 @@
-//! Training of the fields of features at frozen geometry, for all spaces that a scene has features of.
+//! Training of the fields of features, for all spaces that a scene has features of: at frozen geometry, and then
+//! together with it (DIV-FF, 4.1: "only the semantic heads ..., followed by the full model").
+
+use std::ops::ControlFlow;
+use std::path::Path;
 
 use half::f16;
 use rayon::prelude::*;
 
 use super::cache::Sources;
 use super::render::pixel_ray;
-use super::step::{Bags, HeadOptimiser, HeadStep, RayTargets};
+use super::step::{Bags, HeadOptimiser, HeadStep, JointPlan, RayTargets};
 use super::{HeadShape, Heads};
 use crate::config::Config;
 use crate::field::mlp::Precision;
@@ -19,7 +23,7 @@ use crate::semantics::config::SemanticsConfig;
 use crate::semantics::error::SemanticsError;
 use crate::semantics::fields::{SemanticFields, SpaceField};
 use crate::semantics::targets::{EncodedTable, ImageTargets, PartTargets, VideoTargets};
-use crate::train::Trained;
+use crate::train::{Trained, Trainer, step};
 
 /// Streams of random numbers: which pixels are kept, and the steps of each space.
 const PIXEL_STREAM: u64 = 0x7069_7865;
@@ -31,15 +35,21 @@ const SAMPLED: usize = 8;
 /// Steps over which the learning rates rise to their full size.
 const WARM_UP: f32 = 50.0;
 
+/// Steps between two reports.
+const REPORT_EVERY: u64 = 50;
+
+/// Joint training goes through the schedules' rates from this share to their end.
+const JOINT_FROM: f64 = 0.85;
+
 /// How far training of the fields of features has come.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HeadProgress {
-    /// Which space.
-    pub space: Space,
+    /// Name of the space, or that all are trained together with geometry.
+    pub what: &'static str,
     /// Steps done.
     pub step: u64,
-    /// Steps of this space.
-    pub steps: u64,
+    /// Share of all steps that are done, 0–1.
+    pub fraction: f64,
     /// Mean loss of the last step.
     pub loss: f64,
 }
@@ -85,25 +95,30 @@ impl Targets {
     }
 }
 
+/// Whether to go on is asked after every report.
+type Report<'a> = dyn FnMut(&HeadProgress) -> ControlFlow<()> + 'a;
+
 /// Trains the fields of all spaces that the scene has features of; what is absent is told in
-/// [`SemanticFields::skipped`].
+/// [`SemanticFields::skipped`]. Where geometry was trained with them, it is that of the trainer, which resumed that of
+/// `run`; nothing is stored.
 ///
-/// `stop` is asked after every report; `None` if it says so.
+/// `None` if `report` says stop.
 ///
 /// # Errors
-/// [`SemanticsError`] for features that cannot be used.
+/// [`SemanticsError`] for features that cannot be used, [`SemanticsError::Train`] if geometry cannot be trained on.
 pub fn train_features(
     scene: &Scene,
     trained: &Trained,
     config: &Config,
-    report: &mut dyn FnMut(&HeadProgress) -> std::ops::ControlFlow<()>,
-) -> Result<Option<SemanticFields>, SemanticsError> {
+    run: &Path,
+    report: &mut Report,
+) -> Result<Option<(SemanticFields, Option<Trainer>)>, SemanticsError> {
     let settings = &config.semantics;
     let mut fields = SemanticFields::empty(settings.clone(), trained);
     if !settings.enabled {
         fields.skip("clip", "semantics.enabled is off");
         fields.skip("egovideo", "semantics.enabled is off");
-        return Ok(Some(fields));
+        return Ok(Some((fields, None)));
     }
     let frames: Vec<Frame> = scene.frames.iter().filter(|f| f.split == Split::Train).cloned().collect();
     let targets = Targets::load(scene, &frames, settings)?;
@@ -113,27 +128,102 @@ pub fn train_features(
     let pixels = choose_pixels(&targets, &frames, settings, config.seed)?;
     let sources = trace(trained, config, &frames, &pixels);
     let store = FeatureStore::open(scene)?;
+    let mut spaces = Vec::new();
     for space in Space::ALL {
         let trainer = match space {
             Space::Clip => SpaceTrainer::image(&targets, &pixels, &frames, config)?,
             Space::Egovideo => SpaceTrainer::video(&targets, &pixels, &frames, config)?,
         };
-        let Some(trainer) = trainer else {
-            fields.skip(space.name(), "the scene has no features that its settings can use");
-            continue;
-        };
-        let model = store.model(space).map(str::to_owned);
-        match trainer.run(space, trained, config, &sources, report) {
-            Some((heads, compressor)) => {
-                fields.spaces[space as usize] = Some(SpaceField { space, heads, compressor, model });
-            }
-            None => return Ok(None),
+        match trainer {
+            Some(trainer) => spaces.push(trainer.start(space, trained, config, &sources)),
+            None => fields.skip(space.name(), "the scene has no features that its settings can use"),
         }
     }
     if targets.video.is_some() && targets.parts.is_none() {
         fields.skip("parts", "the scene has no part features, or their weight is 0");
     }
-    Ok(Some(fields))
+    let steps = spaces.len() as u64 * settings.steps + settings.joint_steps;
+    let mut alone = Told { report: &mut *report, done: 0, steps };
+    for space in &mut spaces {
+        if space.train(config, &sources, &mut alone).is_break() {
+            return Ok(None);
+        }
+    }
+    drop(sources);
+    let mut trainer = None;
+    let usable = spaces.iter().any(|s| !s.targets.usable.is_empty());
+    if settings.joint_steps > 0 && trained.progress.joint == 0 && usable {
+        let mut resumed = Trainer::resume(scene, config, run)?;
+        if train_jointly(&mut spaces, &mut resumed, &pixels, &frames, config, &mut alone)?.is_break() {
+            return Ok(None);
+        }
+        fields.belongs_to(resumed.trained());
+        trainer = Some(resumed);
+    }
+    for SpaceTraining { space, heads, compressor, .. } in spaces {
+        let model = store.model(space).map(str::to_owned);
+        fields.spaces[space as usize] = Some(SpaceField { space, heads, compressor, model });
+    }
+    Ok(Some((fields, trainer)))
+}
+
+/// Trains everything: by turns geometry alone, by all its losses, and geometry with the features of one space.
+fn train_jointly(
+    spaces: &mut [SpaceTraining],
+    trainer: &mut Trainer,
+    pixels: &[Pixel],
+    frames: &[Frame],
+    config: &Config,
+    told: &mut Told,
+) -> Result<ControlFlow<()>, SemanticsError> {
+    let settings = &config.semantics;
+    let joint = JointPlan {
+        chunks: step::chunks(config.train.rays),
+        samples: settings.samples,
+        weight: settings.joint_weight,
+    };
+    let pixel = |ray: u32| {
+        let Pixel { frame, x, y } = pixels[ray as usize];
+        (frame as usize, (y * frames[frame as usize].camera.width + x) as usize)
+    };
+    trainer.go_on(settings.joint_steps);
+    for n in 1..=settings.joint_steps {
+        let share = JOINT_FROM + (1.0 - JOINT_FROM) * (n as f64 / settings.joint_steps as f64);
+        let mut loss = 0.0;
+        trainer.step(share, None)?;
+        for space in spaces.iter_mut().filter(|s| !s.targets.usable.is_empty()) {
+            let SpaceTraining { space, targets, heads, optimiser, .. } = space;
+            let plan = plan(settings, config, settings.steps + n, share as f32, *space);
+            let geometry = |companion: &dyn step::Companion| trainer.step(share, Some(companion)).map(drop);
+            loss += optimiser.joint_step(heads, targets, pixel, (&plan, joint), geometry)?;
+        }
+        if told.add("with geometry", n, n == settings.joint_steps, loss).is_break() {
+            return Ok(ControlFlow::Break(()));
+        }
+    }
+    Ok(ControlFlow::Continue(()))
+}
+
+/// Reports now and then.
+struct Told<'a, 'b> {
+    report: &'a mut Report<'b>,
+    /// Steps of earlier phases, and of all.
+    done: u64,
+    steps: u64,
+}
+
+impl Told<'_, '_> {
+    /// Tells of step number `step` of a phase; `last`: the phase is over.
+    fn add(&mut self, what: &'static str, step: u64, last: bool, loss: f64) -> ControlFlow<()> {
+        if !step.is_multiple_of(REPORT_EVERY) && !last {
+            return ControlFlow::Continue(());
+        }
+        let fraction = (self.done + step) as f64 / self.steps.max(1) as f64;
+        if last {
+            self.done += step;
+        }
+        (self.report)(&HeadProgress { what, step, fraction, loss })
+    }
 }
 
 /// One pixel, at random, of each square of a size that keeps to the number of rays, where it has a target and no mask
@@ -292,16 +382,8 @@ impl SpaceTrainer {
         Ok((!targets.usable.is_empty()).then_some(Self { compressor, targets, parts: part_dim, frames }))
     }
 
-    /// Trains; `None` if `report` says stop.
-    fn run(
-        self,
-        space: Space,
-        trained: &Trained,
-        config: &Config,
-        sources: &Sources,
-        report: &mut dyn FnMut(&HeadProgress) -> std::ops::ControlFlow<()>,
-    ) -> Option<(Heads, Compressor)> {
-        const REPORT_EVERY: u64 = 50;
+    /// Untrained fields for the geometry of `trained`.
+    fn start(self, space: Space, trained: &Trained, config: &Config, sources: &Sources) -> SpaceTraining {
         let Self { compressor, mut targets, parts, frames } = self;
         let seen = |n: &u32| !sources.of(*n as usize).is_empty();
         targets.usable.retain(seen);
@@ -310,28 +392,38 @@ impl SpaceTrainer {
         let shape = HeadShape::new(settings, &trained.field.shape, frames, compressor.dim(), parts);
         let mut heads = Heads::zeros(shape);
         heads.init(config.seed.wrapping_add(space as u64));
-        if targets.usable.is_empty() {
-            return Some((heads, compressor));
-        }
-        let mut optimiser = HeadOptimiser::new(&heads);
-        for step in 1..=settings.steps {
-            let plan = plan(settings, config, step, space);
-            let loss = optimiser.step(&mut heads, sources, &targets, &plan);
-            if step % REPORT_EVERY == 0 || step == settings.steps {
-                let progress = HeadProgress { space, step, steps: settings.steps, loss };
-                if report(&progress).is_break() {
-                    return None;
-                }
-            }
-        }
-        Some((heads, compressor))
+        let optimiser = HeadOptimiser::new(&heads);
+        SpaceTraining { space, compressor, targets, heads, optimiser }
     }
 }
 
-/// Warm-up, then cosine annealing.
-fn plan(settings: &SemanticsConfig, config: &Config, step: u64, space: Space) -> HeadStep {
-    let turn = std::f32::consts::PI * (step - 1) as f32 / settings.steps as f32;
-    let rate = 0.5 * (1.0 + turn.cos()) * (step as f32 / WARM_UP).min(1.0);
+/// A space in training.
+struct SpaceTraining {
+    space: Space,
+    compressor: Compressor,
+    targets: RayTargets,
+    heads: Heads,
+    optimiser: HeadOptimiser,
+}
+
+impl SpaceTraining {
+    /// Trains at frozen geometry.
+    fn train(&mut self, config: &Config, sources: &Sources, told: &mut Told) -> ControlFlow<()> {
+        let Self { space, targets, heads, optimiser, .. } = self;
+        let steps = config.semantics.steps;
+        for step in 1..=if targets.usable.is_empty() { 0 } else { steps } {
+            let share = (step - 1) as f32 / steps as f32;
+            let plan = plan(&config.semantics, config, step, share, *space);
+            let loss = optimiser.step(heads, sources, targets, &plan);
+            told.add(space.name(), step, step == steps, loss)?;
+        }
+        ControlFlow::Continue(())
+    }
+}
+
+/// Warm-up, then cosine annealing, at the share `at` of the schedule.
+fn plan(settings: &SemanticsConfig, config: &Config, step: u64, at: f32, space: Space) -> HeadStep {
+    let rate = 0.5 * (1.0 + (std::f32::consts::PI * at).cos()) * (step as f32 / WARM_UP).min(1.0);
     HeadStep {
         step,
         rays: settings.rays,

@@ -30,6 +30,7 @@ fn random(seed: u64) -> (Trained, Optimiser) {
         streams_settled: true,
         unexplained: Some(0.125),
         aligned: 2,
+        joint: 0,
         stereo_from: Some(vec![1.5e-3, -0.1, 0.0]),
     };
     let mut trained = Trained { field, grids, progress };

@@ -135,7 +135,7 @@ impl WithSimd for ChunkPass<'_> {
             let net = context.model.field.nets[s].as_ref().expect("all streams are on");
             net.encode(&context.model.weights(s).expect("all streams are on"), batch);
         }
-        let loss = chunk.evaluate(simd, context, &mut tracer, &mut gradient);
+        let loss = chunk.evaluate(simd, context, &mut tracer, &mut gradient, 0);
         chunk.backward(simd, context, &mut tracer, &gradient, dense);
         loss.total
     }
@@ -146,7 +146,8 @@ impl Traced {
         let Self { field, pixels, config, plan, chunk, loss, dense, tables } = self;
         let views: Vec<View> = pixels.frames.iter().map(|f| View::new(field, f)).collect();
         let model = Model::with_precision(field, grids, plan.streams, plan.precision);
-        let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays: CHUNK_RAYS };
+        let (rays, companion) = (CHUNK_RAYS, None);
+        let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays, companion };
         *loss = pulp::Arch::new().dispatch(ChunkPass { context: &context, chunk, dense });
         for s in 0..3 {
             let batch = &chunk.traced.batches[s];

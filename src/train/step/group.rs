@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3};
 use pulp::Simd;
 
-use super::{CHUNK_RAYS, StepPlan};
+use super::{CHUNK_RAYS, Companion, StepPlan};
 use crate::field::stream::StreamBatch;
 use crate::render::density_grid::DensityGrid;
 use crate::render::forward::{Chunk, Model, RayInput, Tracer};
@@ -33,6 +33,7 @@ pub struct Context<'a> {
     pub plan: &'a StepPlan,
     pub seed: u64,
     pub rays: usize,
+    pub companion: Option<&'a dyn Companion>,
 }
 
 /// One chunk of rays of a step.
@@ -48,6 +49,8 @@ pub struct TrainChunk {
 #[derive(Default)]
 pub struct Group {
     pub chunks: Vec<TrainChunk>,
+    /// Number of the first of them.
+    first: usize,
     refresh: [Refresh; 3],
     tracer: Tracer,
     gradient: ChunkGradient,
@@ -62,6 +65,7 @@ impl Group {
     #[inline(always)]
     pub fn place(&mut self, context: &Context, first: usize, chunks: usize) {
         self.chunks.resize_with(chunks, TrainChunk::default);
+        self.first = first;
         for (n, chunk) in self.chunks.iter_mut().enumerate() {
             chunk.choose_rays(context, first + n);
             chunk.place(context, &mut self.tracer, first + n);
@@ -81,12 +85,12 @@ impl Group {
     /// Evaluates the encoded samples and goes all the way back to their encodings.
     #[inline(always)]
     pub fn evaluate<S: Simd>(&mut self, simd: S, context: &Context) {
-        let Self { chunks, refresh, tracer, gradient, dense, loss, evaluations } = self;
+        let Self { chunks, first, refresh, tracer, gradient, dense, loss, evaluations } = self;
         dense.clear();
         dense.resize(context.model.field.layout.len, 0.0);
         (*loss, *evaluations) = (ChunkLoss::default(), 0);
-        for chunk in chunks {
-            let l = chunk.evaluate(simd, context, tracer, gradient);
+        for (number, chunk) in (*first..).zip(chunks) {
+            let l = chunk.evaluate(simd, context, tracer, gradient, number);
             loss.total += l.total;
             loss.squared += l.squared;
             *evaluations += chunk.traced.batches.iter().map(StreamBatch::len).sum::<usize>();
@@ -128,7 +132,13 @@ impl TrainChunk {
         let side = context.plan.patch;
         let mut rng = Rng::new(context.seed, context.plan.step, chunk as u64);
         let mut corner = (0, 0, 1);
+        let given = context.companion.map(|c| c.rays(chunk));
         for k in 0..CHUNK_RAYS {
+            if let Some(rays) = &given {
+                let (frame, pixel) = rays[k];
+                self.add_ray(context, &mut rng, frame, pixel);
+                continue;
+            }
             let in_patch = k as u32 % (side * side);
             if in_patch == 0 {
                 corner = loop {
@@ -151,27 +161,34 @@ impl TrainChunk {
                 true => (x + y * camera.width) as usize,
                 false => first,
             };
-            let (x, y) = (pixel as u32 % camera.width, pixel as u32 / camera.width);
-            let uv =
-                Vec2::new((x as f32 + 0.5) / camera.width as f32, (y as f32 + 0.5) / camera.height as f32);
-            self.inputs.push(RayInput {
-                view: frame as u32,
-                dir_cam: pixels.directions(frame)[pixel],
-                uv,
-                jitter: rng.uniform(),
-            });
-            let field = context.model.field;
-            let mut exposure = [0.0; 6];
-            let gamma = &field.weights[field.layout.exposure.clone()];
-            field.exposure.evaluate(gamma, context.views[frame].knots, &mut exposure);
-            self.targets.push(RayTarget {
-                rgb: pixels.images[frame][pixel].map(|c| f32::from(c) / 255.0),
-                background: [rng.uniform(), rng.uniform(), rng.uniform()],
-                exposure,
-                depth: pixels.stereo_distance(frame, pixel),
-            });
+            self.add_ray(context, &mut rng, frame, pixel);
         }
+        // Rays that somebody else has chosen are no patches.
+        let side = if given.is_some() { 1 } else { side };
         flatness::find(&self.inputs, &self.targets, side as usize, &mut self.bends);
+    }
+
+    fn add_ray(&mut self, context: &Context, rng: &mut Rng, frame: usize, pixel: usize) {
+        let pixels = context.pixels;
+        let camera = &pixels.frames[frame].camera;
+        let (x, y) = (pixel as u32 % camera.width, pixel as u32 / camera.width);
+        let uv = Vec2::new((x as f32 + 0.5) / camera.width as f32, (y as f32 + 0.5) / camera.height as f32);
+        self.inputs.push(RayInput {
+            view: frame as u32,
+            dir_cam: pixels.directions(frame)[pixel],
+            uv,
+            jitter: rng.uniform(),
+        });
+        let field = context.model.field;
+        let mut exposure = [0.0; 6];
+        let gamma = &field.weights[field.layout.exposure.clone()];
+        field.exposure.evaluate(gamma, context.views[frame].knots, &mut exposure);
+        self.targets.push(RayTarget {
+            rgb: pixels.images[frame][pixel].map(|c| f32::from(c) / 255.0),
+            background: [rng.uniform(), rng.uniform(), rng.uniform()],
+            exposure,
+            depth: pixels.stereo_distance(frame, pixel),
+        });
     }
 
     /// Places the samples of the chunk with number `number`.
@@ -188,7 +205,7 @@ impl TrainChunk {
         }
     }
 
-    /// Evaluates the streams and the loss.
+    /// Evaluates the streams and the loss of the chunk with number `number`.
     #[inline(always)]
     pub fn evaluate<S: Simd>(
         &mut self,
@@ -196,9 +213,15 @@ impl TrainChunk {
         context: &Context,
         tracer: &mut Tracer,
         gradient: &mut ChunkGradient,
+        number: usize,
     ) -> ChunkLoss {
         let count = context.plan.sampling.count;
         self.traced.evaluate(simd, tracer, context.model, count);
+        gradient.asked.clear();
+        if let Some(companion) = context.companion {
+            gradient.asked.resize(self.traced.intervals.len(), [0.0; 3]);
+            companion.ask(number, &self.traced, &mut gradient.asked);
+        }
         let scale = 1.0 / context.rays as f32;
         loss::backward(context.config, &self.traced, &self.targets, &self.bends, count, scale, gradient)
     }
