@@ -7,6 +7,7 @@
 
 mod bvh;
 pub mod config;
+pub mod error;
 pub mod eval;
 pub mod extract;
 pub mod field;

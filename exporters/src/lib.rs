@@ -31,4 +31,4 @@ pub use glb::{GlbContents, GlbNode, GlbOptions, GlbScene, Interval, read_glb, wr
 pub use manifest::Manifest;
 pub use npy::{NpyArray, NpyHeader, read_npy, read_npy_header, write_npy};
 pub use npz::{NpzCompression, read_npz, write_npz};
-pub use ply::{PlyOptions, read_ply, write_ply};
+pub use ply::{PlyOptions, read_ply, read_ply_positions, write_ply};

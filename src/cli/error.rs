@@ -117,13 +117,10 @@ impl CliError {
 fn is_input(error: &PipelineError) -> bool {
     use PipelineError as E;
     match error {
-        E::Scene(_) | E::Config(_) | E::NotARun { .. } | E::SceneMoved { .. } | E::Differs { .. } => true,
+        E::Scene(_) | E::Config(_) | E::NotARun(_) | E::SceneMoved { .. } | E::Differs { .. } => true,
         E::Train(error) => matches!(
             **error,
-            TrainError::Scene(_)
-                | TrainError::Config(_)
-                | TrainError::NoPixels
-                | TrainError::Checkpoint { .. }
+            TrainError::Scene(_) | TrainError::Config(_) | TrainError::NoPixels | TrainError::Checkpoint(_)
         ),
         E::Map(error) => {
             matches!(**error, MapError::Scene(_) | MapError::Config(_) | MapError::NoSuchFrame { .. })
@@ -136,7 +133,7 @@ fn is_input(error: &PipelineError) -> bool {
                 | SemanticsError::Relevancy(_)
                 | SemanticsError::Text(_)
                 | SemanticsError::NoFeatures { .. }
-                | SemanticsError::Stored { .. }
+                | SemanticsError::Stored(_)
         ),
         E::Eval(error) => !matches!(**error, EvalError::NonFinite { .. } | EvalError::Render { .. }),
         _ => false,

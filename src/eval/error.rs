@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::surface::SurfaceError;
+use crate::error::FileError;
 use crate::scene::SceneError;
 
 /// Why an evaluation stopped. A measure without truth is not an error: it is left out.
@@ -67,14 +68,9 @@ pub enum EvalError {
         /// The renderer's own error.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// A folder cannot be listed.
-    #[error("{path}: {source}", path = path.display())]
-    Io {
-        /// The folder.
-        path: PathBuf,
-        /// The system's complaint.
-        source: std::io::Error,
-    },
+    /// A folder or file cannot be read.
+    #[error(transparent)]
+    Io(#[from] FileError),
     /// A mesh cannot be read.
     #[error("{source}")]
     Ply {

@@ -8,6 +8,7 @@ use super::images::{ImageSums, RenderedView};
 use super::surface::{self, DepthView, SurfaceMetrics};
 use super::truth::{FrameTruth, depth_view};
 use super::{EvalError, Metrics};
+use crate::error::FileError;
 use crate::scene::{Frame, Scene, Split};
 
 /// Views whose depth says which surfaces were seen: about so many, evenly spread over the training frames.
@@ -186,10 +187,10 @@ fn meshes_of(folder: &Path, stream: &str) -> Result<Vec<(String, PathBuf)>, Eval
     if !folder.is_dir() {
         return Ok(Vec::new());
     }
-    let io = |source| EvalError::Io { path: folder.to_path_buf(), source };
+    let io = FileError::at(folder);
     let mut found = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        let path = entry.map_err(io)?.path();
+    for entry in std::fs::read_dir(folder).map_err(&io)? {
+        let path = entry.map_err(&io)?.path();
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let stem =
             name.strip_prefix(stream).and_then(|n| n.strip_prefix('_')).and_then(|n| n.strip_suffix(".ply"));

@@ -7,6 +7,7 @@ use serde_json::Value;
 
 use super::images::{check_size, mean};
 use super::{EvalError, Metrics};
+use crate::error::FileError;
 use crate::scene::features::Space;
 use crate::scene::{Frame, Scene};
 
@@ -89,7 +90,7 @@ fn json(path: &Path) -> Result<Option<(PathBuf, Value)>, EvalError> {
     if !path.exists() {
         return Ok(None);
     }
-    let bytes = std::fs::read(path).map_err(|source| EvalError::Io { path: path.to_owned(), source })?;
+    let bytes = std::fs::read(path).map_err(FileError::at(path))?;
     let value = serde_json::from_slice(&bytes).map_err(|_| wrong(path, "JSON"))?;
     Ok(Some((path.to_owned(), value)))
 }

@@ -1,6 +1,7 @@
 //! What can go wrong between a trained field and the files of a map.
 
 use crate::config::ConfigError;
+use crate::error::FileError;
 use crate::extract::ExtractError;
 use crate::scene::SceneError;
 
@@ -36,13 +37,8 @@ pub enum MapError {
     #[error(transparent)]
     Write(#[from] divff_exporters::Error),
     /// The folder cannot be made or cleared.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// Folder or file.
-        path: std::path::PathBuf,
-        /// What the system says.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] FileError),
 }
 
 impl From<SceneError> for MapError {

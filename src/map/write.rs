@@ -15,6 +15,7 @@ use divff_exporters::{
 use serde::{Deserialize, Serialize};
 
 use super::{MapError, MapFeatures, MapObject, SemanticMap};
+use crate::error::FileError;
 use crate::field::{Normalisation, Stream};
 
 /// Kinds of files that a map can be written as.
@@ -62,8 +63,7 @@ impl FromStr for Format {
 /// # Errors
 /// A file or the folder cannot be written; nothing is left half-written, and there is then no manifest.
 pub fn write(map: &SemanticMap, folder: &Path, formats: &[Format]) -> Result<Manifest, MapError> {
-    let io = |source| MapError::Io { path: folder.to_owned(), source };
-    std::fs::create_dir_all(folder).map_err(io)?;
+    std::fs::create_dir_all(folder).map_err(FileError::at(folder))?;
     let earlier = retract(folder)?;
     let mut export = Export { folder, manifest: describe(map) };
     for format in Format::ALL.into_iter().filter(|f| formats.contains(f)) {
@@ -100,7 +100,7 @@ fn retract(folder: &Path) -> Result<Vec<String>, MapError> {
 fn remove(path: &Path) -> Result<(), MapError> {
     match std::fs::remove_file(path) {
         Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
-            Err(MapError::Io { path: path.to_owned(), source })
+            Err(FileError::at(path)(source).into())
         }
         _ => Ok(()),
     }

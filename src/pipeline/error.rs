@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use crate::config::ConfigError;
+use crate::error::{BadFile, FileError};
 use crate::eval::EvalError;
 use crate::map::MapError;
 use crate::scene::SceneError;
@@ -35,15 +36,8 @@ pub enum PipelineError {
     #[error(transparent)]
     Report(#[from] crate::report::ReportError),
     /// A folder or file is not (part of) a run.
-    #[error("{}: {what}; {remedy}", path.display())]
-    NotARun {
-        /// The folder or file.
-        path: PathBuf,
-        /// What is wrong.
-        what: String,
-        /// What to do.
-        remedy: &'static str,
-    },
+    #[error(transparent)]
+    NotARun(BadFile),
     /// The scene of a run is not where it was.
     #[error("{}: its scene {} is not there any more; say where it is with --scene", run.display(), scene.display())]
     SceneMoved {
@@ -71,13 +65,8 @@ pub enum PipelineError {
         source: std::io::Error,
     },
     /// A file cannot be read or written.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] FileError),
     /// A file cannot be written.
     #[error(transparent)]
     Write(#[from] divff_exporters::Error),

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::PipelineError;
 use super::fingerprint::fingerprint;
 use crate::config::{Config, ConfigError};
+use crate::error::{BadFile, FileError};
 use crate::scene::Scene;
 use crate::train::Trained;
 
@@ -52,11 +53,8 @@ impl RunFolder {
             (false, _) if folder.root.exists() => "is a file, not the folder of a run",
             (false, _) => "does not exist",
         };
-        Err(PipelineError::NotARun {
-            path: folder.root,
-            what: what.into(),
-            remedy: "give the folder that `divff run` or `divff train` made with --out",
-        })
+        let remedy = "give the folder that `divff run` or `divff train` made with --out";
+        Err(PipelineError::NotARun(BadFile { path: folder.root, what: what.into(), remedy }))
     }
 
     /// The folder itself.
@@ -117,8 +115,7 @@ impl RunFolder {
     /// # Errors
     /// A file cannot be written.
     pub fn write_record(&self, scene: &Scene, config: &Config) -> Result<(), PipelineError> {
-        let path = fs::canonicalize(&scene.root)
-            .map_err(|source| PipelineError::Io { path: scene.root.clone(), source })?;
+        let path = fs::canonicalize(&scene.root).map_err(FileError::at(&scene.root))?;
         let record = RunRecord {
             format: FORMAT,
             scene: path,
@@ -135,11 +132,7 @@ impl RunFolder {
     /// [`PipelineError::NotARun`] for a file that is missing, damaged or of another version.
     pub fn record(&self) -> Result<RunRecord, PipelineError> {
         let path = self.record_path();
-        let bad = |what: String| PipelineError::NotARun {
-            path: path.clone(),
-            what,
-            remedy: "train again with --fresh, or into another folder",
-        };
+        let bad = |what: String| PipelineError::NotARun(unusable(&path, what));
         let bytes = fs::read(&path).map_err(|e| bad(e.to_string()))?;
         let record: RunRecord = serde_json::from_slice(&bytes).map_err(|e| bad(e.to_string()))?;
         match record.format {
@@ -154,11 +147,8 @@ impl RunFolder {
     /// `config.toml` cannot be read, or holds what is not a setting.
     pub fn config(&self) -> Result<Config, PipelineError> {
         let path = self.config_path();
-        let text = fs::read_to_string(&path).map_err(|e| PipelineError::NotARun {
-            path: path.clone(),
-            what: e.to_string(),
-            remedy: "train again with --fresh, or into another folder",
-        })?;
+        let bad = |e: std::io::Error| PipelineError::NotARun(unusable(&path, e.to_string()));
+        let text = fs::read_to_string(&path).map_err(bad)?;
         let config = Config::default().overlaid(&text, &path.display().to_string())?;
         config.validate()?;
         Ok(config)
@@ -192,11 +182,9 @@ impl RunFolder {
     /// [`PipelineError::NotARun`] where training has not stored anything yet; a damaged checkpoint.
     pub fn trained(&self) -> Result<Trained, PipelineError> {
         if !self.has_checkpoint() {
-            return Err(PipelineError::NotARun {
-                path: self.root.clone(),
-                what: "holds no checkpoint yet".into(),
-                remedy: "run `divff train` on it first",
-            });
+            let (path, what) = (self.root.clone(), "holds no checkpoint yet".into());
+            let remedy = "run `divff train` on it first";
+            return Err(PipelineError::NotARun(BadFile { path, what, remedy }));
         }
         Ok(Trained::load(&self.root)?)
     }
@@ -243,13 +231,17 @@ pub fn create_writable(folder: &Path) -> Result<(), PipelineError> {
     fs::remove_file(&probe).map_err(io)
 }
 
+fn unusable(path: &Path, what: String) -> BadFile {
+    let remedy = "train again with --fresh, or into another folder";
+    BadFile { path: path.to_owned(), what, remedy }
+}
+
 /// Writes a value as indented JSON, atomically.
 ///
 /// # Errors
 /// The file cannot be written.
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), PipelineError> {
-    let mut json = serde_json::to_vec_pretty(value)
-        .map_err(|e| PipelineError::Io { path: path.to_owned(), source: e.into() })?;
+    let mut json = serde_json::to_vec_pretty(value).map_err(|e| FileError::at(path)(e.into()))?;
     json.push(b'\n');
     Ok(write_bytes_atomically(path, &json)?)
 }

@@ -5,46 +5,10 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use divff_exporters::atomic::write_bytes_atomically;
-use serde::{Deserialize, Serialize};
 
 use super::PipelineError;
+use crate::error::FileError;
 use crate::train::Progress;
-
-/// One line of `log.jsonl`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct LogLine {
-    /// Steps taken.
-    pub step: u64,
-    /// Share of the schedule that is done, 0–1.
-    pub fraction: f64,
-    /// Seconds of training, over all sessions.
-    pub seconds: f64,
-    /// Mean loss since the last line.
-    pub loss: f64,
-    /// PSNR of the training rays since the last line, dB.
-    pub psnr: f64,
-    /// PSNR of the held-out frames when last looked at, dB.
-    pub test_psnr: Option<f64>,
-    /// Rays per second since the last line.
-    pub rays_per_second: f64,
-    /// Field evaluations per second since the last line.
-    pub samples_per_second: f64,
-}
-
-impl From<&Progress> for LogLine {
-    fn from(p: &Progress) -> Self {
-        Self {
-            step: p.step,
-            fraction: p.fraction,
-            seconds: p.seconds,
-            loss: p.loss,
-            psnr: p.psnr,
-            test_psnr: p.test_psnr,
-            rays_per_second: p.rays_per_second,
-            samples_per_second: p.samples_per_second,
-        }
-    }
-}
 
 /// The open log of a training session.
 pub struct Log {
@@ -67,7 +31,7 @@ impl Log {
         }
         write_bytes_atomically(path, &kept)?;
         let file = OpenOptions::new().append(true).open(path);
-        let file = file.map_err(|source| PipelineError::Io { path: path.to_owned(), source })?;
+        let file = file.map_err(FileError::at(path))?;
         Ok(Self { path: path.to_owned(), file })
     }
 
@@ -76,8 +40,8 @@ impl Log {
     /// # Errors
     /// The file cannot be written.
     pub fn add(&mut self, progress: &Progress) -> Result<(), PipelineError> {
-        let line = to_bytes(&self.path, &progress.into())?;
-        self.file.write_all(&line).map_err(|source| PipelineError::Io { path: self.path.clone(), source })
+        let line = to_bytes(&self.path, progress)?;
+        Ok(self.file.write_all(&line).map_err(FileError::at(&self.path))?)
     }
 }
 
@@ -85,18 +49,17 @@ impl Log {
 ///
 /// # Errors
 /// The file is there but cannot be read.
-pub fn read(path: &Path) -> Result<Vec<LogLine>, PipelineError> {
+pub fn read(path: &Path) -> Result<Vec<Progress>, PipelineError> {
     let text = match fs::read_to_string(path) {
         Ok(text) => text,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
-        Err(source) => return Err(PipelineError::Io { path: path.to_owned(), source }),
+        Err(source) => return Err(FileError::at(path)(source).into()),
     };
     Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect())
 }
 
-fn to_bytes(path: &Path, line: &LogLine) -> Result<Vec<u8>, PipelineError> {
-    let mut bytes = serde_json::to_vec(line)
-        .map_err(|e| PipelineError::Io { path: path.to_owned(), source: e.into() })?;
+fn to_bytes(path: &Path, line: &Progress) -> Result<Vec<u8>, PipelineError> {
+    let mut bytes = serde_json::to_vec(line).map_err(|e| FileError::at(path)(e.into()))?;
     bytes.push(b'\n');
     Ok(bytes)
 }

@@ -34,7 +34,7 @@ pub fn train_features(
     match SemanticFields::load(run.root()) {
         Ok(Some(fields)) if fields.fits(&trained, &config.semantics) => return Ok(Some((fields, trained))),
         // Damaged or of another version: what is derived is made again.
-        Ok(_) | Err(SemanticsError::Stored { .. }) => {}
+        Ok(_) | Err(SemanticsError::Stored(_)) => {}
         Err(error) => return Err(error.into()),
     }
     observer.event(&Event::Stage(Stage::Features));

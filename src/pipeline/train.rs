@@ -10,6 +10,7 @@ use super::folder::{RunFolder, first_difference};
 use super::log::Log;
 use super::{Event, Observer, PipelineError};
 use crate::config::Config;
+use crate::error::FileError;
 use crate::scene::Scene;
 use crate::train::{Trained, Trainer};
 
@@ -96,7 +97,7 @@ fn discard(run: &RunFolder) -> Result<(), PipelineError> {
     }
     let gone = |path: PathBuf, result: std::io::Result<()>| match result {
         Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
-            Err(PipelineError::Io { path, source })
+            Err(PipelineError::Io(FileError { path, source }))
         }
         _ => Ok(()),
     };

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use crate::pipeline::log::LogLine;
+use crate::train::Progress;
 
 const WIDTH: f64 = 720.0;
 const HEIGHT: f64 = 240.0;
@@ -12,7 +12,7 @@ const TOP: f64 = 12.0;
 const RIGHT: f64 = 16.0;
 
 /// PSNR of training rays and held-out frames over seconds of training; `None` where there is nothing to draw.
-pub fn training_curve(log: &[LogLine]) -> Option<String> {
+pub fn training_curve(log: &[Progress]) -> Option<String> {
     let train: Vec<[f64; 2]> = points(log.iter().map(|l| (l.seconds, Some(l.psnr))));
     let mut seen = None;
     // The held-out value is repeated in every line until the next look; only its changes are points.
@@ -136,9 +136,9 @@ fn line(svg: &mut String, class: &str, axes: &Axes, points: &[[f64; 2]]) {
 mod tests {
     use super::*;
 
-    fn log() -> Vec<LogLine> {
+    fn log() -> Vec<Progress> {
         (1..=10)
-            .map(|n| LogLine {
+            .map(|n| Progress {
                 step: 50 * n,
                 fraction: n as f64 / 10.0,
                 seconds: 2.0 * n as f64,

@@ -50,6 +50,9 @@ pub enum SceneError {
         /// The system's reason.
         source: std::io::Error,
     },
+    /// A point cloud cannot be read.
+    #[error(transparent)]
+    Points(divff_exporters::Error),
     /// The path holds none of the known formats.
     #[error("{}: no scene found: {what}; {remedy}", path.display())]
     NotAScene {

@@ -16,7 +16,6 @@ mod image;
 mod inspect;
 mod json;
 mod open;
-mod ply_points;
 mod pose;
 #[cfg(test)]
 mod tests;

@@ -7,13 +7,14 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use divff_exporters::read_ply_positions;
 use glam::{DMat4, DVec3};
 use serde_json::{Map, Value};
 
 use super::draft::{Draft, DraftFrame, ListedSplit};
 use super::error::{Place, SceneError};
 use super::json::{self, Fields};
-use super::{Aabb, Camera, header, ply_points, pose};
+use super::{Aabb, Camera, header, pose};
 
 /// Takes the scene out of the JSON object in `file`; paths are relative to its folder.
 pub(crate) fn read(file: &Path, map: &Map<String, Value>) -> Result<Draft, SceneError> {
@@ -44,8 +45,8 @@ pub(crate) fn read(file: &Path, map: &Map<String, Value>) -> Result<Draft, Scene
     }
     draft.depth_is_ground_truth = top.flag("depth_is_ground_truth")?.unwrap_or(false);
     if let Some(ply) = top.text("ply_file_path")? {
-        let saved = ply_points::read(&root.join(ply))?;
-        draft.points = saved.into_iter().map(|p| undo.of_point(p)).collect();
+        let saved = read_ply_positions(&root.join(ply)).map_err(SceneError::Points)?;
+        draft.points = saved.into_iter().map(|p| undo.of_point(p.into())).collect();
     }
     Ok(draft)
 }

@@ -1,10 +1,9 @@
 //! What can go wrong with features.
 
-use std::path::PathBuf;
-
 use super::compress::CompressError;
 use super::relevancy::RelevancyError;
 use super::text::TextError;
+use crate::error::{BadFile, FileError};
 use crate::scene::SceneError;
 use crate::scene::features::{FeatureError, Space};
 use crate::train::TrainError;
@@ -40,23 +39,11 @@ pub enum SemanticsError {
         why: String,
     },
     /// A file of trained features is damaged, or of another version.
-    #[error("{}: {what}; {remedy}", path.display())]
-    Stored {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        what: String,
-        /// What to do.
-        remedy: &'static str,
-    },
-    /// A file cannot be read.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Stored(BadFile),
+    /// A file cannot be read or written.
+    #[error(transparent)]
+    Io(#[from] FileError),
     /// A file cannot be written.
     #[error(transparent)]
     Write(#[from] divff_exporters::Error),

@@ -13,13 +13,14 @@ use super::error::SemanticsError;
 use super::head::{HeadShape, Heads};
 use super::relevancy::Queries;
 use super::text_source::TextSources;
+use crate::error::{BadFile, FileError};
 use crate::field::Stream;
 use crate::field::hashgrid::Row;
 use crate::scene::features::Space;
 use crate::train::Trained;
 
 /// Version of the file's layout.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
 /// The one key of the metadata.
 const HEADER: &str = "divff";
@@ -169,7 +170,7 @@ impl SemanticFields {
         let metadata = HashMap::from([(HEADER.to_owned(), json)]);
         let bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| bad(&e))?;
         let folder = run.join("checkpoint");
-        std::fs::create_dir_all(&folder).map_err(|source| SemanticsError::Io { path: folder, source })?;
+        std::fs::create_dir_all(&folder).map_err(FileError::at(&folder))?;
         Ok(write_bytes_atomically(&path, &bytes)?)
     }
 
@@ -182,8 +183,7 @@ impl SemanticFields {
         if !path.is_file() {
             return Ok(None);
         }
-        let bytes =
-            std::fs::read(&path).map_err(|source| SemanticsError::Io { path: path.clone(), source })?;
+        let bytes = std::fs::read(&path).map_err(FileError::at(&path))?;
         let bad = |e: &dyn std::fmt::Display| damaged(&path, &e.to_string());
         let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(|e| bad(&e))?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| bad(&e))?;
@@ -303,5 +303,5 @@ fn geometry_id(trained: &Trained) -> u64 {
 
 fn damaged(path: &Path, what: &str) -> SemanticsError {
     let remedy = "delete it and train again: the geometry is kept";
-    SemanticsError::Stored { path: path.to_owned(), what: what.to_owned(), remedy }
+    SemanticsError::Stored(BadFile { path: path.to_owned(), what: what.to_owned(), remedy })
 }

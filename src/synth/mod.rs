@@ -28,6 +28,8 @@ use render::{Body, Lens, Picture, Stage};
 use room::Room;
 use story::Story;
 
+use crate::error::FileError;
+
 /// Horizontal field of view, degrees: a head-mounted camera's.
 const FIELD_OF_VIEW_DEG: f64 = 87.0;
 /// Frames with index 4 modulo 8 are the test split, as where a scene names none.
@@ -132,13 +134,8 @@ pub enum SynthError {
         path: PathBuf,
     },
     /// A folder cannot be made or read.
-    #[error("{path}: {source}", path = path.display())]
-    Io {
-        /// The folder.
-        path: PathBuf,
-        /// The system's complaint.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] FileError),
     /// An image cannot be encoded.
     #[error("{path}: {source}", path = path.display())]
     Image {

@@ -14,6 +14,7 @@ use serde_json::{Map, Value, json};
 use super::mesh::Mesh;
 use super::render::Picture;
 use super::{Kitchen, SynthError, SynthOptions, arms};
+use crate::error::FileError;
 
 /// Millimetres per metre: depth is stored as 16-bit millimetres.
 const DEPTH_UNITS: f32 = 1000.0;
@@ -23,13 +24,12 @@ const STREAMS: [&str; 3] = ["persistent", "dynamic", "actor"];
 
 /// Makes the folders.
 pub(super) fn prepare(out: &Path) -> Result<(), SynthError> {
-    let io = |path: &Path, source| SynthError::Io { path: path.to_path_buf(), source };
-    if out.exists() && fs::read_dir(out).map_err(|e| io(out, e))?.next().is_some() {
+    if out.exists() && fs::read_dir(out).map_err(FileError::at(out))?.next().is_some() {
         return Err(SynthError::NotEmpty { path: out.to_path_buf() });
     }
     for folder in ["images", "depth", "gt/streams", "gt/instances", "gt/mesh"] {
         let folder = out.join(folder);
-        fs::create_dir_all(&folder).map_err(|e| io(&folder, e))?;
+        fs::create_dir_all(&folder).map_err(FileError::at(&folder))?;
     }
     Ok(())
 }
@@ -61,7 +61,7 @@ fn png(path: &Path, pixels: &[u8], size: (u32, u32), color: ExtendedColorType) -
         .write_image(pixels, size.0, size.1, color)
         .map_err(|source| SynthError::Image { path: path.to_path_buf(), source })?;
     // Plain writes: it is `transforms.json` that makes the folder a scene.
-    fs::write(path, file.into_inner()).map_err(|source| SynthError::Io { path: path.to_path_buf(), source })
+    Ok(fs::write(path, file.into_inner()).map_err(FileError::at(path))?)
 }
 
 /// `gt/mesh/persistent.ply`, and `dynamic_…` and `actor_…` of some test frames.

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::error::TrainError;
 use super::step::Optimiser;
 use crate::config::Config;
+use crate::error::{BadFile, FileError};
 use crate::field::hashgrid::Row;
 use crate::field::{Field, FieldShape, Stream};
 use crate::render::forward::Grids;
@@ -141,7 +142,7 @@ impl Trained {
     pub fn save(&self, run: &Path, grid_cells: f32, optimiser: Option<&Optimiser>) -> Result<(), TrainError> {
         let path = Self::path(run);
         let folder = run.join("checkpoint");
-        std::fs::create_dir_all(&folder).map_err(|source| TrainError::Io { path: folder, source })?;
+        std::fs::create_dir_all(&folder).map_err(FileError::at(&folder))?;
         let header = Header {
             format: FORMAT,
             shape: self.field.shape.clone(),
@@ -187,7 +188,7 @@ impl Trained {
 
     fn load_with(run: &Path, optimiser: bool) -> Result<(Self, Option<Optimiser>), TrainError> {
         let path = Self::path(run);
-        let bytes = std::fs::read(&path).map_err(|source| TrainError::Io { path: path.clone(), source })?;
+        let bytes = std::fs::read(&path).map_err(FileError::at(&path))?;
         let bad = |e: safetensors::SafeTensorError| damaged(&path, &e.to_string());
         let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(bad)?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(bad)?;
@@ -283,9 +284,6 @@ impl Optimiser {
 }
 
 fn damaged(path: &Path, what: &str) -> TrainError {
-    TrainError::Checkpoint {
-        path: path.to_owned(),
-        what: what.to_owned(),
-        remedy: "train again with another --out, or delete the checkpoint",
-    }
+    let remedy = "train again with another --out, or delete the checkpoint";
+    TrainError::Checkpoint(BadFile { path: path.to_owned(), what: what.to_owned(), remedy })
 }

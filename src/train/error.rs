@@ -1,8 +1,7 @@
 //! What can go wrong while training.
 
-use std::path::PathBuf;
-
 use crate::config::ConfigError;
+use crate::error::{BadFile, FileError};
 use crate::scene::SceneError;
 
 /// Why training cannot start, continue or be stored.
@@ -31,23 +30,11 @@ pub enum TrainError {
         index: usize,
     },
     /// A checkpoint that is damaged or of another field.
-    #[error("{}: {what}; {remedy}", path.display())]
-    Checkpoint {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        what: String,
-        /// What to do.
-        remedy: &'static str,
-    },
+    #[error(transparent)]
+    Checkpoint(BadFile),
     /// A file cannot be read or written.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] FileError),
     /// A file cannot be written.
     #[error(transparent)]
     Write(#[from] divff_exporters::Error),

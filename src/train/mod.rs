@@ -9,6 +9,7 @@ pub mod loss;
 pub mod pixels;
 mod schedule;
 pub mod step;
+pub mod table_pass;
 #[cfg(test)]
 pub(crate) mod testing;
 mod trainer;

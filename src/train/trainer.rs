@@ -4,6 +4,8 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use serde::{Deserialize, Serialize};
+
 use super::align;
 use super::checkpoint::{Trained, TrainingState};
 use super::config::StreamChoice;
@@ -48,8 +50,8 @@ const SETTLE_AFTER: u64 = 500;
 /// Share of such blocks above which something moves.
 const MOVING_SHARE: f64 = 0.03;
 
-/// What the caller hears while training goes on.
-#[derive(Clone, Copy, Debug)]
+/// What the caller hears while training goes on; a line of a run's `log.jsonl`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
     /// Steps taken.
     pub step: u64,

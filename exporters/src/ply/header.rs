@@ -9,6 +9,8 @@ use crate::error::{Error, Result};
 pub(super) enum Encoding {
     /// Packed, little endian.
     BinaryLittleEndian,
+    /// Packed, big endian.
+    BinaryBigEndian,
     /// White space between decimal numbers.
     Ascii,
 }
@@ -51,7 +53,16 @@ impl Scalar {
         }
     }
 
-    /// The value at the start of `bytes`; every type fits an f64 exactly. `None` when there are too few
+    /// The big-endian value at the start of `bytes`, as [`Self::read`].
+    pub(super) fn read_big_endian(self, bytes: &[u8]) -> Option<f64> {
+        let mut reversed = [0; 8];
+        let reversed = &mut reversed[..self.size()];
+        reversed.copy_from_slice(bytes.get(..self.size())?);
+        reversed.reverse();
+        self.read(reversed)
+    }
+
+    /// The little-endian value at the start of `bytes`; every type fits an f64 exactly. `None` when there are too few
     /// bytes.
     pub(super) fn read(self, bytes: &[u8]) -> Option<f64> {
         Some(match self {
@@ -90,7 +101,7 @@ impl Element {
     pub(super) fn min_row_bytes(&self, encoding: Encoding) -> usize {
         match encoding {
             Encoding::Ascii => 2 * self.properties.len(),
-            Encoding::BinaryLittleEndian => {
+            Encoding::BinaryLittleEndian | Encoding::BinaryBigEndian => {
                 self.properties.iter().map(|p| p.list.unwrap_or(p.scalar).size()).sum()
             }
         }
@@ -111,7 +122,7 @@ pub(super) struct Header {
 /// Parses the header and checks that the file is long enough for the rows it announces.
 ///
 /// # Errors
-/// `Invalid` with the byte offset of the offending line; `Unsupported` for big-endian files.
+/// `Invalid` with the byte offset of the offending line; `Unsupported` for an unknown encoding.
 pub(super) fn parse_header(path: &Path, file: &[u8]) -> Result<Header> {
     let mut header = Header { encoding: Encoding::Ascii, elements: vec![], comments: vec![], bytes: 0 };
     let mut has_format = false;
@@ -162,6 +173,7 @@ pub(super) fn parse_header(path: &Path, file: &[u8]) -> Result<Header> {
 fn parse_encoding(path: &Path, name: &str) -> Result<Encoding> {
     match name {
         "binary_little_endian" => Ok(Encoding::BinaryLittleEndian),
+        "binary_big_endian" => Ok(Encoding::BinaryBigEndian),
         "ascii" => Ok(Encoding::Ascii),
         _ => Err(Error::Unsupported {
             path: path.to_owned(),

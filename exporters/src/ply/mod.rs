@@ -7,7 +7,7 @@ mod header;
 mod read;
 mod write;
 
-pub use read::read_ply;
+pub use read::{read_ply, read_ply_positions};
 pub use write::{PlyOptions, write_ply};
 
 #[cfg(test)]

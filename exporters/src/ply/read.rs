@@ -19,7 +19,7 @@ struct Column {
     values: Vec<f64>,
 }
 
-/// Reads a mesh or point cloud; binary little endian (any scalar types) or ASCII.
+/// Reads a mesh or point cloud; binary (any scalar types) or ASCII.
 ///
 /// Polygons are split into fans. `float`, `double` → f32 columns, integers → i32, `uchar` → u8. Columns
 /// `<name>_000`, `<name>_001`, … become [`Features`]; a `scalar_` prefix is taken off; other names are made
@@ -27,7 +27,7 @@ struct Column {
 ///
 /// # Errors
 /// `Io`; `Invalid` with the byte offset for any contradiction or early end; `NonFinite` for NaN and infinity;
-/// `Unsupported` for big-endian files and lists on vertices.
+/// `Unsupported` for lists on vertices.
 pub fn read_ply(path: &Path) -> Result<Geometry> {
     let file = fs::read(path).map_err(|source| Error::io(path, source))?;
     let header = parse_header(path, &file)?;
@@ -43,6 +43,32 @@ pub fn read_ply(path: &Path) -> Result<Geometry> {
     }
     let geometry = assemble(path, &header, columns, triangles)?;
     check(path, geometry)
+}
+
+/// Reads the positions of the vertices alone, whatever other columns hold.
+///
+/// # Errors
+/// As [`read_ply`], but for values that are not positions.
+pub fn read_ply_positions(path: &Path) -> Result<Vec<[f64; 3]>> {
+    let file = fs::read(path).map_err(|source| Error::io(path, source))?;
+    let header = parse_header(path, &file)?;
+    let mut body = Body { path, file: &file, at: header.bytes, encoding: header.encoding };
+    for element in &header.elements {
+        if element.name != "vertex" {
+            body.skip(element)?;
+            continue;
+        }
+        let mut columns = body.read_columns(element)?;
+        let mut take = |name: &str| {
+            let column = columns.iter_mut().find(|c| c.name == name);
+            let missing = || Error::invalid(path, format!("its vertices have no property `{name}`"));
+            Ok(std::mem::take(&mut column.ok_or_else(missing)?.values))
+        };
+        let (x, y, z) = (take("x")?, take("y")?, take("z")?);
+        let rows = x.into_iter().zip(y).zip(z);
+        return Ok(rows.map(|((x, y), z)| [x, y, z]).collect());
+    }
+    Err(Error::invalid(path, "the file has no vertices"))
 }
 
 /// The invariants, with the file's name in the message where the file is to blame.
@@ -68,14 +94,16 @@ struct Body<'a> {
 impl Body<'_> {
     fn next(&mut self, scalar: Scalar) -> Result<f64> {
         match self.encoding {
-            Encoding::BinaryLittleEndian => {
-                let value =
-                    scalar.read(&self.file[self.at..]).ok_or_else(|| self.error("the file is cut short"))?;
-                self.at += scalar.size();
-                Ok(value)
-            }
+            Encoding::BinaryLittleEndian => self.next_binary(scalar, Scalar::read),
+            Encoding::BinaryBigEndian => self.next_binary(scalar, Scalar::read_big_endian),
             Encoding::Ascii => self.next_word(),
         }
+    }
+
+    fn next_binary(&mut self, scalar: Scalar, read: impl Fn(Scalar, &[u8]) -> Option<f64>) -> Result<f64> {
+        let value = read(scalar, &self.file[self.at..]).ok_or_else(|| self.error("the file is cut short"))?;
+        self.at += scalar.size();
+        Ok(value)
     }
 
     fn next_word(&mut self) -> Result<f64> {

@@ -182,7 +182,7 @@ fn nonsense_is_an_error_that_says_where() {
     let face = "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n";
     assert!(message(&format!("{head}{face}3 0 0 1\n")).contains("triangle 0"));
     assert!(message(&format!("{head}{face}3 0 0 -1\n")).contains("no vertex index"));
-    assert!(message("ply\nformat binary_big_endian 1.0\nend_header\n").contains("binary_little_endian"));
+    assert!(message("ply\nformat binary_pdp_endian 1.0\nend_header\n").contains("binary_little_endian"));
     assert!(message("solid cube\n").contains("no PLY file"));
     assert!(message("ply\nformat ascii 1.0\nproperty float x\nend_header\n").contains("before any element"));
     let list = "ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar float clip\nend_header\n1 0\n";

@@ -10,13 +10,14 @@ use rayon::prelude::*;
 
 use super::cache::Sources;
 use super::{HeadModel, Heads};
-use crate::field::hashgrid::{FEATURES, Level, Row};
+use crate::field::hashgrid::FEATURES;
 use crate::field::mlp::{Activations, Precision};
 use crate::field::stream::StreamBatch;
 use crate::rng::Rng;
 use crate::simd::TILE;
 use crate::simd::matrix::Unit;
 use crate::train::adam::{self, Moments, StepSize, TableState};
+use crate::train::table_pass::TablePass;
 
 mod joint;
 
@@ -184,7 +185,8 @@ impl HeadOptimiser {
                 let levels = net.grid.levels.iter().enumerate();
                 // Finest levels first: they take longest.
                 for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)).rev() {
-                    let pass = TablePass { groups, stream: s, number, level, table, state, rate };
+                    let batches = groups.iter().map(move |g| &g.batches[s]);
+                    let pass = TablePass { batches, number, level, table, state, rate };
                     scope.spawn(move |_| arch.dispatch(pass));
                 }
             }
@@ -366,32 +368,5 @@ impl Group {
             let tiles = sample.len().div_ceil(TILE);
             net.mlp.accumulate(simd, &unit, packed, activations, tiles, &mut gradient[s]);
         }
-    }
-}
-
-/// Scatters one level's gradients and updates its table.
-struct TablePass<'a> {
-    groups: &'a [Group],
-    stream: usize,
-    number: usize,
-    level: &'a Level,
-    table: &'a mut [Row],
-    state: &'a mut TableState,
-    rate: StepSize,
-}
-
-impl WithSimd for TablePass<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let Self { groups, stream, number, level, table, state, rate } = self;
-        for batch in groups.iter().map(|g| &g.batches[stream]).filter(|b| !b.is_empty()) {
-            let rows = &batch.levels[number].rows[..batch.len()];
-            for (pos, g) in batch.tiles().iter().zip(rows.chunks(TILE)) {
-                level.scatter(&mut state.grad, pos, g);
-            }
-        }
-        state.update(table, rate);
     }
 }

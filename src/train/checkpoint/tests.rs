@@ -84,7 +84,7 @@ fn every_truncation_is_refused() {
     for n in lengths {
         file.set_len(n as u64).expect("a file can be cut");
         assert!(
-            matches!(Trained::load(run.path()), Err(TrainError::Checkpoint { .. })),
+            matches!(Trained::load(run.path()), Err(TrainError::Checkpoint(_))),
             "{n} of {} bytes were taken for a checkpoint",
             bytes.len()
         );
@@ -105,7 +105,7 @@ fn a_field_without_optimiser_can_be_used_but_not_resumed() {
     let (trained, _) = random(4);
     let run = saved(&trained, None);
     assert!(Trained::load(run.path()).is_ok());
-    assert!(matches!(Trained::resume(run.path()), Err(TrainError::Checkpoint { .. })));
+    assert!(matches!(Trained::resume(run.path()), Err(TrainError::Checkpoint(_))));
 }
 
 /// Replaces text in the header by text of the same length.
@@ -137,7 +137,7 @@ fn a_header_that_asks_for_more_than_the_file_holds_is_refused() {
         tamper(&run, from, to);
         let loaded = Trained::load(run.path());
         assert!(
-            matches!(loaded, Err(TrainError::Checkpoint { .. } | TrainError::Config(_))),
+            matches!(loaded, Err(TrainError::Checkpoint(_) | TrainError::Config(_))),
             "{to} was taken for a checkpoint"
         );
     }

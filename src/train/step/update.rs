@@ -2,16 +2,12 @@
 
 use std::ops::Range;
 
-use pulp::{Simd, WithSimd};
-
-use super::group::Group;
 use super::{Optimiser, StepPlan};
 use crate::field::Field;
-use crate::field::hashgrid::{Level, Row};
 use crate::render::forward::Grids;
 use crate::render::rays::View;
-use crate::simd::TILE;
-use crate::train::adam::{self, Moments, StepSize, TableState};
+use crate::train::adam::{self, Moments, StepSize};
+use crate::train::table_pass::TablePass;
 
 /// Updates everything that is learned, and the density grids.
 pub fn update(
@@ -30,8 +26,10 @@ pub fn update(
         for (s, (tables, states)) in field.tables.iter_mut().zip(tables).enumerate() {
             let (true, Some(net)) = (plan.streams[s], &field.nets[s]) else { continue };
             let levels = net.grid.levels.iter().enumerate();
-            for ((n, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)).rev() {
-                let pass = TablePass { groups, stream: s, number: n, level, table, state, rate };
+            for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)).rev() {
+                let chunks = groups.iter().flat_map(|g| &g.chunks);
+                let batches = chunks.map(move |chunk| &chunk.traced.batches[s]);
+                let pass = TablePass { batches, number, level, table, state, rate };
                 scope.spawn(move |_| arch.dispatch(pass));
             }
         }
@@ -77,35 +75,4 @@ fn update_dense(field: &mut Field, moments: &mut Moments, gradient: &[f32], plan
     apply(layout.exposure.clone(), plan.exposure_rate);
     apply(layout.pose.clone(), plan.pose_rate);
     apply(layout.rig.clone(), plan.rig_rate);
-}
-
-/// Scatters one level's gradients and updates its table.
-struct TablePass<'a> {
-    groups: &'a [Group],
-    stream: usize,
-    number: usize,
-    level: &'a Level,
-    table: &'a mut [Row],
-    state: &'a mut TableState,
-    rate: StepSize,
-}
-
-impl WithSimd for TablePass<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let Self { groups, stream, number, level, table, state, rate } = self;
-        for chunk in groups.iter().flat_map(|g| &g.chunks) {
-            let batch = &chunk.traced.batches[stream];
-            if batch.is_empty() {
-                continue;
-            }
-            let rows = &batch.levels[number].rows[..batch.len()];
-            for (pos, g) in batch.tiles().iter().zip(rows.chunks(TILE)) {
-                level.scatter(&mut state.grad, pos, g);
-            }
-        }
-        state.update(table, rate);
-    }
 }
