@@ -110,7 +110,7 @@ impl Default for SemanticsConfig {
             layers: 1,
             steps: 1500,
             joint_steps: 100,
-            joint_weight: 1.0,
+            joint_weight: 20.0,
             rays: 4096,
             cached_rays: 800_000,
             samples: 8,
