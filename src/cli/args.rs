@@ -134,6 +134,9 @@ pub struct SettingsArgs {
     /// Time for training, such as 90s, 5m or 1h30m; the schedule then follows the clock
     #[arg(long, value_name = "TIME", value_parser = parse_duration)]
     pub time_budget: Option<Duration>,
+    /// Compress features to as few numbers as lose at most this (1 - mean cosine, such as 0.02), instead of to 32
+    #[arg(long, value_name = "E")]
+    pub feature_error: Option<f64>,
 }
 
 /// File formats of an export.

@@ -37,6 +37,10 @@ pub fn resolve(args: &SettingsArgs) -> Result<Config, CliError> {
     if let Some(budget) = args.time_budget {
         config.time_budget_s = Some(budget.as_secs_f64());
     }
+    if let Some(error) = args.feature_error {
+        config.semantics.compress.feature_error = error;
+        config.semantics.compress.dim = None;
+    }
     config.validate()?;
     Ok(config)
 }
@@ -102,8 +106,12 @@ mod tests {
             set: vec!["train.rays=128".into()],
             seed: None,
             time_budget: None,
+            feature_error: Some(0.05),
         };
         let config = resolve(&args).unwrap();
         assert_eq!((config.seed, config.train.steps, config.train.rays), (3, 10, 128));
+        let compress = &config.semantics.compress;
+        assert_eq!((compress.dim, compress.feature_error), (None, 0.05));
+        assert!(resolve(&SettingsArgs { feature_error: Some(2.0), ..args }).is_err());
     }
 }
