@@ -9,6 +9,7 @@ use rayon::prelude::*;
 
 use super::cache::Sources;
 use super::render::pixel_ray;
+use super::scale::{MAX_KNOTS, Pyramid};
 use super::step::{Bags, HeadOptimiser, HeadStep, JointPlan, RayTargets};
 use super::{HeadShape, Heads};
 use crate::config::Config;
@@ -22,7 +23,7 @@ use crate::semantics::compress::{CompressConfig, Compressor};
 use crate::semantics::config::SemanticsConfig;
 use crate::semantics::error::SemanticsError;
 use crate::semantics::fields::{SemanticFields, SpaceField};
-use crate::semantics::targets::{EncodedTable, ImageTargets, PartTargets, VideoTargets};
+use crate::semantics::targets::{EncodedTable, ImageMode, ImageTargets, PartTargets, VideoTargets};
 use crate::train::{Trained, Trainer, step};
 
 /// Streams of random numbers: which pixels are kept, and the steps of each space.
@@ -131,7 +132,7 @@ pub fn train_features(
     let mut spaces = Vec::new();
     for space in Space::ALL {
         let trainer = match space {
-            Space::Clip => SpaceTrainer::image(&targets, &pixels, &frames, config)?,
+            Space::Clip => SpaceTrainer::image(&targets, &pixels, &frames, &sources, config)?,
             Space::Egovideo => SpaceTrainer::video(&targets, &pixels, &frames, config)?,
         };
         match trainer {
@@ -307,6 +308,7 @@ impl SpaceTrainer {
         targets: &Targets,
         pixels: &[Pixel],
         frames: &[Frame],
+        sources: &Sources,
         config: &Config,
     ) -> Result<Option<Self>, SemanticsError> {
         let Some(image) = &targets.image else { return Ok(None) };
@@ -319,7 +321,10 @@ impl SpaceTrainer {
             encoded.blend(&blend, &mut z);
             Some((z, [1.0, 0.0]))
         };
-        let targets = gather(pixels, frames, dim, dim, of);
+        let targets = match config.semantics.image.mode {
+            ImageMode::ScaledPatches => pyramid_targets(image, &encoded, pixels, frames, &sources.depth),
+            _ => gather(pixels, frames, dim, dim, of),
+        };
         let frames = image.frames().count();
         Ok((!targets.usable.is_empty()).then_some(Self { compressor, targets, parts: 0, frames }))
     }
@@ -389,7 +394,8 @@ impl SpaceTrainer {
         targets.usable.retain(seen);
         targets.bags = targets.bags.only(targets.dim, seen);
         let settings = &config.semantics;
-        let shape = HeadShape::new(settings, &trained.field.shape, frames, compressor.dim(), parts);
+        let mut shape = HeadShape::new(settings, &trained.field.shape, frames, compressor.dim(), parts);
+        shape.scales = targets.pyramid.as_ref().map(|p| p.sizes(&targets.usable));
         let mut heads = Heads::zeros(shape);
         heads.init(config.seed.wrapping_add(space as u64));
         let optimiser = HeadOptimiser::new(&heads);
@@ -478,5 +484,39 @@ fn gather(
         .collect();
     let usable = (0..pixels.len() as u32).filter(|n| weights[*n as usize][0] > 0.0).collect();
     let times = pixels.iter().map(|p| frames[p.frame as usize].time as f32).collect();
-    RayTargets { width, dim, values, weights, usable, times, bags: Bags::default() }
+    RayTargets { width, dim, values, weights, usable, times, ..RayTargets::default() }
+}
+
+/// Targets at all scales that patches have; `depth` is that of each pixel, units.
+///
+/// Between its own scales a frame's targets are linear, so what is kept at the scales of all frames is exact.
+fn pyramid_targets(
+    image: &ImageTargets,
+    encoded: &EncodedTable,
+    pixels: &[Pixel],
+    frames: &[Frame],
+    depth: &[f32],
+) -> RayTargets {
+    let (dim, knots) = (encoded.dim, image.all_scales(MAX_KNOTS));
+    let of = |p: &Pixel| {
+        let frame = p.frame as usize;
+        let all = image.at(frame, p.x, p.y)?;
+        let mut z = vec![0.0; knots.len() * dim];
+        for (z, knot) in z.chunks_exact_mut(dim).zip(&knots) {
+            // Where a scale has no usable patch here, the others tell.
+            encoded.blend(&image.at_scale(frame, p.x, p.y, *knot).unwrap_or(all), z);
+        }
+        Some((z, [1.0, 0.0]))
+    };
+    let targets = gather(pixels, frames, knots.len() * dim, dim, of);
+    let height = |(p, z): (&Pixel, &f32)| {
+        let camera = &frames[p.frame as usize].camera;
+        z * (f64::from(camera.height) / camera.fy) as f32
+    };
+    let pyramid = Pyramid {
+        shares: pixels.iter().map(|p| image.scales(p.frame as usize).unwrap_or_default()).collect(),
+        heights: pixels.iter().zip(depth).map(height).collect(),
+        knots,
+    };
+    RayTargets { width: dim, pyramid: Some(pyramid), ..targets }
 }

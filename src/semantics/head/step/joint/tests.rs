@@ -94,6 +94,7 @@ fn targets(bagged: bool) -> RayTargets {
         usable: (0..CHUNK_RAYS as u32).collect(),
         times: vec![0.0; CHUNK_RAYS],
         bags,
+        pyramid: None,
     }
 }
 
