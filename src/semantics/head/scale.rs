@@ -10,12 +10,15 @@ use half::f16;
 
 use super::HeadShape;
 use super::step::RayTargets;
+use super::train::{Pixel, gather};
 use crate::field::hashgrid::FEATURES;
 use crate::rng::Rng;
+use crate::scene::Frame;
+use crate::semantics::targets::{EncodedTable, ImageTargets};
 use crate::simd::TILE;
 
 /// Most scales that targets are kept at.
-pub const MAX_KNOTS: usize = 8;
+const MAX_KNOTS: usize = 8;
 
 /// Share of the rays whose sizes may lie beyond either end of the range that networks tell apart: a few very near or
 /// very far ones would take most of it.
@@ -60,6 +63,40 @@ impl Pyramid {
         // Rays of one size still need a range.
         [low, end(1, 1.0 - BEYOND).max(1.01 * low)]
     }
+}
+
+/// Targets at all scales that patches have; `depth` is that of each pixel, units.
+///
+/// Between its own scales a frame's targets are linear, so what is kept at the scales of all frames is exact.
+pub(super) fn pyramid_targets(
+    image: &ImageTargets,
+    encoded: &EncodedTable,
+    pixels: &[Pixel],
+    frames: &[Frame],
+    depth: &[f32],
+) -> RayTargets {
+    let (dim, knots) = (encoded.dim, image.all_scales(MAX_KNOTS));
+    let of = |p: &Pixel| {
+        let frame = p.frame as usize;
+        let all = image.at(frame, p.x, p.y)?;
+        let mut z = vec![0.0; knots.len() * dim];
+        for (z, knot) in z.chunks_exact_mut(dim).zip(&knots) {
+            // Where a scale has no usable patch here, the others tell.
+            encoded.blend(&image.at_scale(frame, p.x, p.y, *knot).unwrap_or(all), z);
+        }
+        Some((z, [1.0, 0.0]))
+    };
+    let targets = gather(pixels, frames, knots.len() * dim, dim, of);
+    let height = |(p, z): (&Pixel, &f32)| {
+        let camera = &frames[p.frame as usize].camera;
+        z * (f64::from(camera.height) / camera.fy) as f32
+    };
+    let pyramid = Pyramid {
+        shares: pixels.iter().map(|p| image.scales(p.frame as usize).unwrap_or_default()).collect(),
+        heights: pixels.iter().zip(depth).map(height).collect(),
+        knots,
+    };
+    RayTargets { width: dim, pyramid: Some(pyramid), ..targets }
 }
 
 impl RayTargets {

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::cache::Sources;
 use super::render::pixel_ray;
-use super::scale::{MAX_KNOTS, Pyramid};
+use super::scale::pyramid_targets;
 use super::step::{Bags, HeadOptimiser, HeadStep, JointPlan, RayTargets};
 use super::{HeadShape, Heads};
 use crate::config::Config;
@@ -57,10 +57,10 @@ pub struct HeadProgress {
 
 /// A pixel of the cache.
 #[derive(Clone, Copy)]
-struct Pixel {
-    frame: u32,
-    x: u32,
-    y: u32,
+pub(super) struct Pixel {
+    pub frame: u32,
+    pub x: u32,
+    pub y: u32,
 }
 
 /// Targets of all spaces, for the training frames.
@@ -301,7 +301,7 @@ struct SpaceTrainer {
 }
 
 /// Target of one pixel: what it adds to `[width]` and the weights of its two parts.
-type Target = Option<(Vec<f32>, [f32; 2])>;
+pub(super) type Target = Option<(Vec<f32>, [f32; 2])>;
 
 impl SpaceTrainer {
     fn image(
@@ -465,7 +465,7 @@ fn bags(video: &VideoTargets, encoded: &EncodedTable, pixels: &[Pixel]) -> Bags 
 }
 
 /// The targets of all pixels as one table.
-fn gather(
+pub(super) fn gather(
     pixels: &[Pixel],
     frames: &[Frame],
     width: usize,
@@ -485,38 +485,4 @@ fn gather(
     let usable = (0..pixels.len() as u32).filter(|n| weights[*n as usize][0] > 0.0).collect();
     let times = pixels.iter().map(|p| frames[p.frame as usize].time as f32).collect();
     RayTargets { width, dim, values, weights, usable, times, ..RayTargets::default() }
-}
-
-/// Targets at all scales that patches have; `depth` is that of each pixel, units.
-///
-/// Between its own scales a frame's targets are linear, so what is kept at the scales of all frames is exact.
-fn pyramid_targets(
-    image: &ImageTargets,
-    encoded: &EncodedTable,
-    pixels: &[Pixel],
-    frames: &[Frame],
-    depth: &[f32],
-) -> RayTargets {
-    let (dim, knots) = (encoded.dim, image.all_scales(MAX_KNOTS));
-    let of = |p: &Pixel| {
-        let frame = p.frame as usize;
-        let all = image.at(frame, p.x, p.y)?;
-        let mut z = vec![0.0; knots.len() * dim];
-        for (z, knot) in z.chunks_exact_mut(dim).zip(&knots) {
-            // Where a scale has no usable patch here, the others tell.
-            encoded.blend(&image.at_scale(frame, p.x, p.y, *knot).unwrap_or(all), z);
-        }
-        Some((z, [1.0, 0.0]))
-    };
-    let targets = gather(pixels, frames, knots.len() * dim, dim, of);
-    let height = |(p, z): (&Pixel, &f32)| {
-        let camera = &frames[p.frame as usize].camera;
-        z * (f64::from(camera.height) / camera.fy) as f32
-    };
-    let pyramid = Pyramid {
-        shares: pixels.iter().map(|p| image.scales(p.frame as usize).unwrap_or_default()).collect(),
-        heights: pixels.iter().zip(depth).map(height).collect(),
-        knots,
-    };
-    RayTargets { width: dim, pyramid: Some(pyramid), ..targets }
 }
