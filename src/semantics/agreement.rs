@@ -17,6 +17,9 @@ use crate::scene::{Frame, Scene, Split};
 /// Frames of a split that are looked at, evenly spread; not all of them have features.
 const FRAMES: usize = 24;
 
+/// Scale at which fields with scales are compared, as a share of the image's height: the middle of LERF's pyramid.
+const SHARE: f32 = 1.0 / 3.0;
+
 /// Every so many pixels along a frame's rows and columns.
 const STRIDE: u32 = 4;
 
@@ -43,12 +46,18 @@ pub fn feature_cosines(
             let heads = HeadModel::new(&field.heads, Precision::F32);
             let rendered = |frame: &Frame| {
                 let sources = trace_frame(model, frame, sampling, config.samples);
-                render_features(&heads, &sources, frame.time as f32).values
+                // Fields with scales are held against patches of one scale, at the size that this is at every pixel.
+                let height = SHARE * (f64::from(frame.camera.height) / frame.camera.fy) as f32;
+                let size = |ray: usize| height * sources.depth[ray];
+                render_features(&heads, &sources, frame.time as f32, size).values
             };
             let of = Compared { compressor: &field.compressor, frames: &frames };
             let mean = match field.space {
-                Space::Clip => ImageTargets::load(&store, &frames, config.image)?
-                    .and_then(|t| of.mean(&t.table, t.frames().collect(), rendered, |f, x, y| t.at(f, x, y))),
+                Space::Clip => ImageTargets::load(&store, &frames, config.image)?.and_then(|t| {
+                    let scaled = field.heads.shape.scales.is_some();
+                    let target = |f, x, y| if scaled { t.at_scale(f, x, y, SHARE) } else { t.at(f, x, y) };
+                    of.mean(&t.table, t.frames().collect(), rendered, target)
+                }),
                 Space::Egovideo => VideoTargets::load(&store, &frames, config.video)?.and_then(|t| {
                     of.mean(&t.table, t.frames().collect(), rendered, |f, x, y| t.at(f, x, y).patch)
                 }),

@@ -9,7 +9,7 @@ use super::config::SemanticsConfig;
 use super::error::SemanticsError;
 use super::fields::{SemanticFields, SpaceField};
 use super::head::HeadModel;
-use super::relevancy::{Points, Queries};
+use super::relevancy::Queries;
 use super::text_source::{TextSources, slug};
 use crate::field::Stream;
 use crate::field::mlp::Precision;
@@ -23,6 +23,9 @@ use crate::train::Trained;
 /// Phrases of a space that get a column each; a long list of embeddings is there to be asked, not to be stored.
 const MOST_PHRASES: usize = 24;
 
+/// Some of the points of a geometry: their stream, time and numbers.
+type Part = (Stream, f32, std::ops::Range<usize>);
+
 /// What is written at every vertex for one space.
 struct Columns<'a> {
     field: &'a SpaceField,
@@ -30,10 +33,15 @@ struct Columns<'a> {
     queries: Option<Queries>,
     /// Names of the columns, in the order of the queries.
     names: Vec<String>,
+    /// Sizes at which scores are tried beside that of the features.
+    others: Vec<f32>,
 }
 
 /// Adds the features of all spaces, and the scores of the phrases that come with the scene, to every geometry of the
 /// map and to its points: `<space>_pca`, `relevancy_<slug>` (image-language) and `affordance_<slug>` (video-language).
+///
+/// Where features depend on a size, those of the middle size are written, and the scores of the best one for each
+/// phrase and geometry.
 ///
 /// # Errors
 /// Embeddings that cannot be used, or features that are not finite.
@@ -60,8 +68,7 @@ pub fn annotate(
             let stream = object.stream;
             let points = place.points(&map.geometries[n], stream, frame);
             let time = frame.map_or(0.0, |f| f.time as f32);
-            let features = columns.features(&[(stream, time, 0..points.len())], &points);
-            columns.add(&mut map.geometries[n], features)?;
+            columns.add(&mut map.geometries[n], &[(stream, time, 0..points.len())], &points)?;
         }
         // The cloud holds what stays, and then what is moved at its first time.
         let first = map.objects.iter().find(|o| o.stream == Stream::Dynamic).and_then(|o| o.frame_index);
@@ -75,8 +82,7 @@ pub fn annotate(
         let points = place.points(&map.points, Stream::Persistent, None);
         let time = frame.map_or(0.0, |f| f.time as f32);
         let parts = [(Stream::Persistent, 0.0, 0..moving), (Stream::Dynamic, time, moving..points.len())];
-        let features = columns.features(&parts, &points);
-        columns.add(&mut map.points, features)?;
+        columns.add(&mut map.points, &parts, &points)?;
     }
     Ok(())
 }
@@ -118,24 +124,27 @@ impl<'a> Columns<'a> {
                 Map::Autoencoder(_) => None,
             },
         });
-        Ok(Self { field, heads: HeadModel::new(&field.heads, Precision::F32), queries, names })
+        let others = field.heads.shape.other_sizes(config.query_scales);
+        Ok(Self { field, heads: HeadModel::new(&field.heads, Precision::F32), queries, names, others })
     }
 
-    /// Features of `points`, part by part: a stream, a time and which of the points.
-    fn features(&self, parts: &[(Stream, f32, std::ops::Range<usize>)], points: &[Vec3]) -> Vec<f32> {
+    /// Features of `points` at `size`.
+    fn features(&self, parts: &[Part], points: &[Vec3], size: f32) -> Vec<f32> {
         let dim = self.field.heads.shape.dim;
         let mut values = vec![0.0; points.len() * dim];
         for (stream, time, range) in parts {
             let out = &mut values[range.start * dim..range.end * dim];
-            self.heads.features(*stream, &points[range.clone()], *time, out);
+            self.heads.features(*stream, &points[range.clone()], *time, size, out);
         }
         values
     }
 
-    fn add(&self, geometry: &mut Geometry, values: Vec<f32>) -> Result<(), SemanticsError> {
+    fn add(&self, geometry: &mut Geometry, parts: &[Part], points: &[Vec3]) -> Result<(), SemanticsError> {
+        let at = |size: f32| self.features(parts, points, size);
+        let values = at(self.field.heads.shape.middle_size());
         if let Some(queries) = &self.queries {
-            let found = queries.score(Points::F32(&values))?;
-            for (name, scores) in self.names.iter().zip(found.scores) {
+            let found = queries.best_scores(&values, &self.others, at)?;
+            for (name, scores) in self.names.iter().zip(found) {
                 if geometry.attributes.iter().all(|a| a.name != *name) {
                     let values = AttributeValues::F32(scores);
                     geometry.attributes.push(Attribute { name: name.clone(), values });

@@ -46,6 +46,8 @@ pub struct SemanticsConfig {
     pub compress: CompressConfig,
     /// τ of relevancies.
     pub temperature: f32,
+    /// Sizes that are tried for a phrase, where features depend on one (`scaled-patches`).
+    pub query_scales: usize,
     /// Encoding of what stays.
     pub persistent: HeadStreamConfig,
     /// Encoding of what moves.
@@ -103,6 +105,7 @@ impl Default for SemanticsConfig {
             // out, so an error target would ask for dimensions that hold nothing.
             compress: CompressConfig { dim: Some(32), ..CompressConfig::default() },
             temperature: LERF_TEMPERATURE,
+            query_scales: 15,
             persistent,
             dynamic,
             actor,
@@ -136,6 +139,8 @@ impl SemanticsConfig {
             |key, value: String, ok: bool, remedy| if ok { Ok(()) } else { Err((key, value, remedy)) };
         let t = self.temperature;
         range("semantics.temperature", t.to_string(), t > 0.0 && t <= 1e6, "must be above 0 and up to 1e6")?;
+        let n = self.query_scales;
+        range("semantics.query_scales", n.to_string(), (1..=256).contains(&n), "must be 1 to 256")?;
         let p = self.part_weight;
         range("semantics.part_weight", p.to_string(), (0.0..=100.0).contains(&p), "must be 0 to 100")?;
         let n = self.pooled_rays;

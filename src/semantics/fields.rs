@@ -112,8 +112,9 @@ impl SemanticFields {
 
     /// Whether they were trained on this geometry, with these settings.
     pub fn fits(&self, trained: &Trained, config: &SemanticsConfig) -> bool {
-        // τ only matters to those who ask.
-        let asked = SemanticsConfig { temperature: self.config.temperature, ..config.clone() };
+        // τ and the sizes that are tried only matter to those who ask.
+        let SemanticsConfig { temperature, query_scales, .. } = self.config;
+        let asked = SemanticsConfig { temperature, query_scales, ..config.clone() };
         self.geometry == geometry_id(trained) && self.config == asked
     }
 
@@ -247,7 +248,8 @@ impl SpaceHeader {
             && (1..=512).contains(&shape.hidden)
             && shape.frames < 1 << 24
             && shape.extent.min_element() > 0.0
-            && shape.extent.max_element() <= 1.0;
+            && shape.extent.max_element() <= 1.0
+            && shape.scales.is_none_or(|[low, high]| low > 0.0 && high > low && high.is_finite());
         // Encodings are those of settings that have been checked already.
         let as_config = SemanticsConfig {
             persistent: shape.encodings[0].clone(),

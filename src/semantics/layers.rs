@@ -7,7 +7,7 @@ use super::config::SemanticsConfig;
 use super::error::SemanticsError;
 use super::fields::{SemanticFields, SpaceField};
 use super::head::{FeatureImage, HeadModel, render_features, trace_frame};
-use super::relevancy::{Points, Queries};
+use super::relevancy::Queries;
 use super::text_source::{TextSources, slug};
 use crate::field::mlp::Precision;
 use crate::render::forward::Model;
@@ -29,6 +29,7 @@ struct Asked<'a> {
 pub struct FeatureLayers<'a> {
     spaces: Vec<Asked<'a>>,
     samples: usize,
+    query_scales: usize,
 }
 
 /// Features and scores of one frame.
@@ -45,7 +46,8 @@ pub struct FrameFeatures {
 impl<'a> FeatureLayers<'a> {
     /// Nothing yet.
     pub fn new(config: &SemanticsConfig) -> Self {
-        Self { spaces: Vec::new(), samples: config.samples.max(8) }
+        let (samples, query_scales) = (config.samples.max(8), config.query_scales);
+        Self { spaces: Vec::new(), samples, query_scales }
     }
 
     /// Adds the features of a space, if `features`, and the scores of `phrases`; `temperature` is τ.
@@ -89,11 +91,14 @@ impl<'a> FeatureLayers<'a> {
         let sources = trace_frame(model, frame, sampling, self.samples);
         let mut out = FrameFeatures { coverage: sources.opacity.clone(), ..FrameFeatures::default() };
         for asked in &self.spaces {
-            let image = render_features(&asked.heads, &sources, frame.time as f32);
+            let at = |size: f32| render_features(&asked.heads, &sources, frame.time as f32, |_| size);
+            let shape = &asked.heads.heads.shape;
+            let image = at(shape.middle_size());
             let space = asked.field.space;
             if let Some(queries) = &asked.queries {
-                let found = queries.score(Points::F32(&image.values))?;
-                let named = asked.phrases.iter().cloned().zip(found.scores);
+                let others = shape.other_sizes(self.query_scales);
+                let found = queries.best_scores(&image.values, &others, |size| at(size).values)?;
+                let named = asked.phrases.iter().cloned().zip(found);
                 out.scores.extend(named.map(|(phrase, scores)| (space, phrase, scores)));
             }
             if asked.features {

@@ -82,6 +82,8 @@ pub struct Sources {
     sources: Vec<Source>,
     /// Opacity of each ray.
     pub opacity: Vec<f32>,
+    /// Mean z-depth of each ray's sources, units; 0 without any.
+    pub depth: Vec<f32>,
 }
 
 impl Sources {
@@ -106,17 +108,19 @@ impl Sources {
             all.first.extend(part.first[1..].iter().map(|f| f + start));
             all.sources.extend(part.sources);
             all.opacity.extend(part.opacity);
+            all.depth.extend(part.depth);
         }
         all
     }
 
-    /// Rays whose samples have the given weights, streams and positions.
+    /// Rays whose samples have the given weights, streams and positions; all at depth 1.
     #[cfg(test)]
     pub(super) fn of_rays(rays: Vec<Vec<(f32, u8, Vec3)>>) -> Self {
         let mut all = Self { first: vec![0], ..Self::default() };
         for of_ray in rays {
             let found = |(weight, stream, place)| Found { weight, stream, sample: 0, place };
             all.add(1.0, &mut of_ray.into_iter().map(found).collect(), usize::MAX);
+            all.depth.push(1.0);
         }
         all
     }
@@ -164,6 +168,9 @@ impl WithSimd for TracePass<'_> {
             find(&chunk, &mut found);
             for (ray, found) in chunk.rays.iter().zip(&mut found) {
                 out.add(1.0 - ray.left, found, keep);
+                let light: f32 = found.iter().map(|f| f.weight).sum();
+                let t: f32 = found.iter().map(|f| f.weight * chunk.intervals[f.sample as usize].t).sum();
+                out.depth.push(if light > 0.0 { t / light * ray.ray.refined_cam.z } else { 0.0 });
             }
         }
         out

@@ -6,6 +6,7 @@
 
 pub mod cache;
 mod render;
+pub mod scale;
 mod step;
 #[cfg(test)]
 mod tests;
@@ -52,6 +53,10 @@ pub struct HeadShape {
     pub frames: usize,
     /// The streams that there are.
     pub streams: [bool; 3],
+    /// Smallest and largest size, units, that the networks tell apart, if what a point looks like depends on that of
+    /// the patch around it: see [`scale`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scales: Option<[f32; 2]>,
 }
 
 /// The network of one stream.
@@ -94,6 +99,7 @@ impl HeadShape {
             extent: field.normalisation.extent,
             frames,
             streams: field.streams,
+            scales: None,
         }
     }
 
@@ -116,7 +122,7 @@ impl HeadShape {
 
     fn net(&self, stream: Stream) -> HeadNet {
         let grid = self.grid(stream);
-        let mut widths = vec![grid.width()];
+        let mut widths = vec![grid.width() + if self.scales.is_some() { FEATURES } else { 0 }];
         widths.extend(std::iter::repeat_n(self.hidden, self.layers));
         widths.push(self.width());
         HeadNet { mlp: Mlp::new(&widths), grid }
@@ -173,17 +179,21 @@ impl<'a> HeadModel<'a> {
     }
 
     /// Features of stream `stream` at `points` (units; [`crate::render::forward::Model::actor_point`] for the actor)
-    /// at `time`, to `out` `[points, shape.dim]`; zeros where the scene has no such stream.
-    pub fn features(&self, stream: Stream, points: &[Vec3], time: f32, out: &mut [f32]) {
+    /// at `time`, to `out` `[points, shape.dim]`; zeros where the scene has no such stream. `size`, units, matters to
+    /// fields with scales alone.
+    pub fn features(&self, stream: Stream, points: &[Vec3], time: f32, size: f32, out: &mut [f32]) {
         let dim = self.heads.shape.dim;
         out.par_chunks_mut(BATCH * dim).zip(points.par_chunks(BATCH)).for_each(|(out, points)| {
             let mut batch = StreamBatch::default();
             points.iter().enumerate().for_each(|(n, p)| batch.push(n, n, *p, time));
-            pulp::Arch::new().dispatch(PointPass { model: self, stream: stream as usize, batch, out });
+            let stream = stream as usize;
+            pulp::Arch::new().dispatch(PointPass { model: self, stream, batch, size: |_| size, out });
         });
     }
 
     /// Encodes `batch` and evaluates stream `s`; `out(tile, rows)` gets the outputs, a row of lanes a number.
+    ///
+    /// `size` of a sample, by its number, is asked for fields with scales alone.
     #[inline(always)]
     fn forward<S: Simd>(
         &self,
@@ -191,6 +201,7 @@ impl<'a> HeadModel<'a> {
         s: usize,
         batch: &mut StreamBatch,
         activations: &mut Activations,
+        size: impl Fn(usize) -> f32,
         mut out: impl FnMut(usize, &[f32]),
     ) {
         let Some((net, packed)) = self.net(s) else { return };
@@ -206,6 +217,16 @@ impl<'a> HeadModel<'a> {
             for (level, out) in batch.levels.iter().zip(input.chunks_exact_mut(FEATURES * TILE)) {
                 level.read_tile(n, out);
             }
+            if let Some(range) = self.heads.shape.scales {
+                let samples = &batch.sample[n * TILE..];
+                let size = |lane: usize| size(samples[lane] as usize);
+                scale::write_tile(
+                    range,
+                    size,
+                    TILE.min(samples.len()),
+                    &mut input[net.grid.width() * TILE..],
+                );
+            }
             net.mlp.forward(simd, &unit, packed, activations, n);
             out(n, activations.output(n));
         }
@@ -213,25 +234,27 @@ impl<'a> HeadModel<'a> {
 }
 
 /// Features at the samples of a batch, whose numbers are those of the rows of `out`.
-struct PointPass<'a> {
+struct PointPass<'a, F> {
     model: &'a HeadModel<'a>,
     stream: usize,
     batch: StreamBatch,
+    /// Of a sample.
+    size: F,
     out: &'a mut [f32],
 }
 
-impl WithSimd for PointPass<'_> {
+impl<F: Fn(usize) -> f32> WithSimd for PointPass<'_, F> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { model, stream, mut batch, out } = self;
+        let Self { model, stream, mut batch, size, out } = self;
         let dim = model.heads.shape.dim;
         if model.net(stream).is_none() {
             return out.fill(0.0);
         }
         let count = batch.len();
-        model.forward(simd, stream, &mut batch, &mut Activations::default(), |tile, rows| {
+        model.forward(simd, stream, &mut batch, &mut Activations::default(), size, |tile, rows| {
             for lane in 0..TILE.min(count - tile * TILE) {
                 let out = &mut out[(tile * TILE + lane) * dim..][..dim];
                 for (k, o) in out.iter_mut().enumerate() {

@@ -48,8 +48,13 @@ pub(super) fn pixel_ray(frame: &Frame, directions: &[Vec3], view: u32, pixel: us
     RayInput { view, dir_cam: directions[pixel], uv, jitter: 0.5 }
 }
 
-/// Σ w f over the sources of each ray, at `time`.
-pub fn render_features(heads: &HeadModel, sources: &Sources, time: f32) -> FeatureImage {
+/// Σ w f over the sources of each ray, at `time`; `size` of a ray, units, matters to fields with scales alone.
+pub fn render_features(
+    heads: &HeadModel,
+    sources: &Sources,
+    time: f32,
+    size: impl Fn(usize) -> f32 + Sync,
+) -> FeatureImage {
     let dim = heads.heads.shape.dim;
     let mut values = vec![0.0; sources.len() * dim];
     values.par_chunks_mut(TASK_RAYS * dim).enumerate().for_each(|(task, out)| {
@@ -69,7 +74,8 @@ pub fn render_features(heads: &HeadModel, sources: &Sources, time: f32) -> Featu
                 continue;
             }
             let mut points = vec![0.0; shares.len() * dim];
-            let pass = PointPass { model: heads, stream: s, batch, out: &mut points };
+            let size = |sample: usize| size(first + shares[sample].0);
+            let pass = PointPass { model: heads, stream: s, batch, size, out: &mut points };
             pulp::Arch::new().dispatch(pass);
             for ((ray, share), f) in shares.iter().zip(points.chunks_exact(dim)) {
                 let out = &mut out[ray * dim..][..dim];

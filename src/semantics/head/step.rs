@@ -9,6 +9,7 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::cache::Sources;
+use super::scale::Pyramid;
 use super::{HeadModel, Heads};
 use crate::field::hashgrid::FEATURES;
 use crate::field::mlp::{Activations, Precision};
@@ -33,7 +34,7 @@ pub struct RayTargets {
     pub width: usize,
     /// How many of them are the descriptor's.
     pub dim: usize,
-    /// `[rays, width]`.
+    /// `[rays, width]`, or `[rays, knots, width]` if there is a pyramid.
     pub values: Vec<half::f16>,
     /// Weights of the two parts of the loss; 0: no target.
     pub weights: Vec<[f32; 2]>,
@@ -43,6 +44,8 @@ pub struct RayTargets {
     pub times: Vec<f32>,
     /// Rays that share a descriptor; if there are any, steps choose among them and not among `usable`.
     pub bags: Bags,
+    /// Set if descriptors depend on scale; a step then draws one for every ray.
+    pub pyramid: Option<Pyramid>,
 }
 
 /// Rays that one descriptor describes together: those of a patch, or of a hotspot.
@@ -128,6 +131,8 @@ pub(super) struct Group {
     rays: Vec<u32>,
     /// Bags that the rays are of, each with as many rays; empty if each ray is by itself.
     bags: Vec<u32>,
+    /// Scale that was drawn for each ray, as a share of the image's height; empty without a pyramid.
+    drawn: Vec<f32>,
     batches: [StreamBatch; 3],
     /// Share of each lane in its ray.
     shares: [Vec<f32>; 3],
@@ -218,7 +223,7 @@ impl WithSimd for GroupPass<'_> {
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { group, model, sources, targets, count } = self;
         group.place(sources, targets);
-        group.render(simd, model, targets.width, |_, _, _| ());
+        group.render(simd, model, targets, |_, _, _| ());
         group.compare(targets, count);
         group.back(simd, model, targets.width);
     }
@@ -231,7 +236,7 @@ impl Group {
         Self { rays, bags, ..Self::default() }
     }
 
-    /// Chooses `count` rays, or as many of `bags` bags.
+    /// Chooses `count` rays, or as many of `bags` bags, and their scales.
     fn choose(&mut self, rng: &mut Rng, targets: &RayTargets, count: usize, bags: usize) {
         let Self { rays, bags: chosen, .. } = self;
         rays.clear();
@@ -240,7 +245,7 @@ impl Group {
             rays.extend((0..count).map(|_| targets.usable[rng.below(targets.usable.len())]));
             // Neighbours in the cache are neighbours in a picture, and share table rows.
             rays.sort_unstable();
-            return;
+            return self.draw(rng, targets);
         }
         for _ in 0..bags {
             let bag = rng.below(targets.bags.len());
@@ -248,6 +253,20 @@ impl Group {
             chosen.push(bag as u32);
             rays.extend((0..count / bags).map(|_| members[rng.below(members.len())]));
         }
+        self.draw(rng, targets);
+    }
+
+    /// Draws the scales of the chosen rays.
+    pub(super) fn draw(&mut self, rng: &mut Rng, targets: &RayTargets) {
+        self.drawn.clear();
+        let Some(pyramid) = &targets.pyramid else { return };
+        self.drawn.extend(self.rays.iter().map(|ray| pyramid.draw(*ray as usize, rng)));
+    }
+
+    /// Scales as they were drawn.
+    #[cfg(test)]
+    pub(super) fn drawn(&self) -> &[f32] {
+        &self.drawn
     }
 
     /// Gradient of lane by lane encodings, after [`GroupPass`]: positions and rows of stream `s`.
@@ -277,15 +296,18 @@ impl Group {
         &mut self,
         simd: S,
         model: &HeadModel,
-        width: usize,
+        targets: &RayTargets,
         mut outputs: impl FnMut(usize, usize, &[f32]),
     ) {
-        let Self { rays, batches, shares, activations, rendered, .. } = self;
+        let Self { rays, drawn, batches, shares, activations, rendered, .. } = self;
+        let width = targets.width;
+        let heights = targets.pyramid.as_ref().map_or(&[][..], |p| &p.heights);
+        let size = |n: usize| drawn[n] * heights[rays[n] as usize];
         rendered.clear();
         rendered.resize(rays.len() * width, 0.0);
         for (s, batch) in batches.iter_mut().enumerate().filter(|(_, b)| !b.is_empty()) {
             let rays: Vec<u32> = batch.sample.clone();
-            model.forward(simd, s, batch, &mut activations[s], |tile, rows| {
+            model.forward(simd, s, batch, &mut activations[s], size, |tile, rows| {
                 outputs(s, tile, rows);
                 let lanes = rays[tile * TILE..].iter().zip(&shares[s][tile * TILE..]).take(TILE);
                 for (lane, (ray, share)) in lanes.enumerate() {
@@ -303,13 +325,14 @@ impl Group {
         let (width, dim) = (targets.width, targets.dim);
         self.loss = 0.0;
         let off = self.off_bags(targets);
-        for (ray, rendered) in self.rays.iter().zip(self.rendered.chunks_exact_mut(width)) {
-            let ray = *ray as usize;
-            let target = &targets.values[ray * width..][..width];
+        let mut target = Vec::with_capacity(width);
+        for (n, rendered) in self.rendered.chunks_exact_mut(width).enumerate() {
+            let ray = self.rays[n] as usize;
+            targets.value(ray, self.drawn.get(n).copied().unwrap_or(0.0), &mut target);
             let mut loss = 0.0;
-            for (k, (r, t)) in rendered.iter_mut().zip(target).enumerate() {
+            for (k, (r, t)) in rendered.iter_mut().zip(&target).enumerate() {
                 let weight = targets.weights[ray][usize::from(k >= dim)];
-                let off = *r - t.to_f32();
+                let off = *r - t;
                 loss += weight * off * off;
                 *r = 2.0 * weight * off / count;
             }

@@ -4,6 +4,7 @@ use glam::Vec3;
 use half::f16;
 
 use super::cache::Sources;
+use super::scale::Pyramid;
 use super::step::{Bags, Group, GroupPass, HeadOptimiser, HeadStep, RayTargets};
 use super::*;
 use crate::field::hashgrid::{AXES, Points, TIME};
@@ -29,12 +30,18 @@ fn shape() -> HeadShape {
         extent: Vec3::new(1.0, 0.7, 0.6),
         frames: 6,
         streams: [true; 3],
+        scales: None,
     }
 }
 
+/// The same with scales.
+fn scaled_shape() -> HeadShape {
+    HeadShape { scales: Some([0.05, 1.2]), ..shape() }
+}
+
 /// Fields whose numbers are all random.
-fn random_heads(seed: u64) -> Heads {
-    let mut heads = Heads::zeros(shape());
+fn random_heads(shape: HeadShape, seed: u64) -> Heads {
+    let mut heads = Heads::zeros(shape);
     let mut rng = Rng::new(seed, 1, 0);
     let mut noise = || rng.uniform() - 0.5;
     heads.weights.iter_mut().flatten().for_each(|w| *w = noise());
@@ -72,18 +79,39 @@ fn random_rays(count: usize, seed: u64) -> (Sources, RayTargets) {
     (Sources::of_rays(rays), targets)
 }
 
-/// The loss of all rays in f64; `share` is how much each source counts.
-fn reference(heads: &Heads, sources: &Sources, targets: &RayTargets, share: impl Fn(f32) -> f64) -> f64 {
+/// The same rays with targets at three scales.
+fn with_pyramid(mut targets: RayTargets, seed: u64) -> RayTargets {
+    let mut rng = Rng::new(seed, 3, 0);
+    let (knots, rays) = (vec![0.1, 0.25, 0.5], targets.weights.len());
+    targets.values =
+        (0..rays * knots.len() * targets.width).map(|_| f16::from_f32(rng.uniform() - 0.5)).collect();
+    let shares = (0..rays).map(|n| if n % 3 == 0 { [0.25, 0.5] } else { [0.1, 0.5] }).collect();
+    let heights = (0..rays).map(|_| 0.5 + 2.0 * rng.uniform()).collect();
+    targets.pyramid = Some(Pyramid { knots, shares, heights });
+    targets
+}
+
+/// The loss of all rays in f64; `share` is how much each source counts, `drawn` the scale of each ray.
+fn reference(
+    heads: &Heads,
+    sources: &Sources,
+    targets: &RayTargets,
+    drawn: &[f32],
+    share: impl Fn(f32) -> f64,
+) -> f64 {
     let (mut loss, mut all) = (0.0, Vec::new());
     for ray in 0..sources.len() {
-        let mut rendered = vec![0.0; targets.width];
+        let scale = drawn.get(ray).copied().unwrap_or(0.0);
+        let size = targets.pyramid.as_ref().map_or(0.0, |p| scale * p.heights[ray]);
+        let (mut rendered, mut target) = (vec![0.0; targets.width], Vec::new());
+        targets.value(ray, scale, &mut target);
         for source in sources.of(ray) {
             let s = usize::from(source.stream);
-            let f = evaluate(heads, s, source.position(), targets.times[ray]);
+            let f = evaluate(heads, s, source.position(), targets.times[ray], size);
             rendered.iter_mut().zip(f).for_each(|(r, f)| *r += share(source.share()) * f);
         }
         for (k, r) in rendered.iter().enumerate() {
-            let off = r - f64::from(targets.values[ray * targets.width + k].to_f32());
+            let off = r - f64::from(target[k]);
             loss += f64::from(targets.weights[ray][usize::from(k >= targets.dim)]) * off * off;
         }
         all.push(rendered);
@@ -100,7 +128,7 @@ fn reference(heads: &Heads, sources: &Sources, targets: &RayTargets, share: impl
 }
 
 /// One point in f64, the interpolation (which is linear in the tables) aside.
-fn evaluate(heads: &Heads, s: usize, p: Vec3, time: f32) -> Vec<f64> {
+fn evaluate(heads: &Heads, s: usize, p: Vec3, time: f32, size: f32) -> Vec<f64> {
     let net = heads.nets[s].as_ref().unwrap();
     let mut points: Points = [[0.5; TILE]; AXES];
     (points[0][0], points[1][0], points[2][0], points[TIME][0]) = (p.x, p.y, p.z, time);
@@ -109,6 +137,10 @@ fn evaluate(heads: &Heads, s: usize, p: Vec3, time: f32) -> Vec<f64> {
         let mut rows = [Row::ZERO; 1];
         level.encode(table, &points, &mut rows);
         x.extend(rows[0].to_array().map(f64::from));
+    }
+    if let Some([low, high]) = heads.shape.scales {
+        let u = (f64::from(size) / f64::from(low)).ln() / (f64::from(high) / f64::from(low)).ln();
+        x.extend((1..=4).map(|k| (f64::from(k) * std::f64::consts::PI * u.clamp(0.0, 1.0)).cos()));
     }
     let widths = net.mlp.widths().to_vec();
     x.resize(widths[0], 0.0);
@@ -128,11 +160,15 @@ fn evaluate(heads: &Heads, s: usize, p: Vec3, time: f32) -> Vec<f64> {
     x
 }
 
-/// Analytic gradients of all networks, and of the tables.
-fn gradients(heads: &Heads, sources: &Sources, targets: &RayTargets) -> ([Vec<f32>; 3], [Vec<Vec<Row>>; 3]) {
+/// Gradients of the networks and tables, and the scales that were drawn.
+type Gradients = ([Vec<f32>; 3], [Vec<Vec<Row>>; 3], Vec<f32>);
+
+/// Analytic gradients.
+fn gradients(heads: &Heads, sources: &Sources, targets: &RayTargets) -> Gradients {
     let model = HeadModel::new(heads, Precision::F32);
     let bags = (0..targets.bags.len() as u32).collect();
     let mut group = Group::of(targets.usable.clone(), bags);
+    group.draw(&mut Rng::new(6, 4, 0), targets);
     let count = sources.len() as f32;
     pulp::Arch::new().dispatch(GroupPass { group: &mut group, model: &model, sources, targets, count });
     let tables = std::array::from_fn(|s| {
@@ -147,16 +183,17 @@ fn gradients(heads: &Heads, sources: &Sources, targets: &RayTargets) -> ([Vec<f3
         });
         scattered.collect()
     });
-    (group.gradient.clone(), tables)
+    (group.gradient.clone(), tables, group.drawn().to_vec())
 }
 
 /// Largest deviation of the analytic gradients from central differences, relative to the largest gradient.
-fn worst(share: impl Fn(f32) -> f64 + Copy) -> f64 {
+fn worst(scales: bool, share: impl Fn(f32) -> f64 + Copy) -> f64 {
     const H: f32 = 2e-3;
-    let heads = random_heads(3);
+    let heads = random_heads(if scales { scaled_shape() } else { shape() }, 3);
     let (sources, targets) = random_rays(60, 5); // five bags
-    let (networks, tables) = gradients(&heads, &sources, &targets);
-    let loss = |heads: &Heads| reference(heads, &sources, &targets, share);
+    let targets = if scales { with_pyramid(targets, 5) } else { targets };
+    let (networks, tables, drawn) = gradients(&heads, &sources, &targets);
+    let loss = |heads: &Heads| reference(heads, &sources, &targets, &drawn, share);
     let mut worst = 0.0f64;
     for s in 0..3 {
         let largest = networks[s].iter().fold(0.0f32, |m, g| m.max(g.abs()));
@@ -185,15 +222,19 @@ fn worst(share: impl Fn(f32) -> f64 + Copy) -> f64 {
 
 #[test]
 fn gradients_are_those_of_the_f64_reference() {
-    let off = worst(f64::from);
-    assert!(off < 0.01, "{off}");
+    for scales in [false, true] {
+        let off = worst(scales, f64::from);
+        assert!(off < 0.01, "{off}, scales: {scales}");
+    }
 }
 
 #[test]
 fn the_comparison_of_gradients_notices_a_wrong_weight() {
     // The same with every source counting a tenth more: what a forgotten factor would do.
-    let off = worst(|share| 1.1 * f64::from(share));
-    assert!(off > 0.05, "{off}");
+    for scales in [false, true] {
+        let off = worst(scales, |share| 1.1 * f64::from(share));
+        assert!(off > 0.05, "{off}, scales: {scales}");
+    }
 }
 
 fn plan(step: u64) -> HeadStep {
@@ -208,9 +249,10 @@ fn plan(step: u64) -> HeadStep {
     }
 }
 
-fn trained(threads: usize, steps: u64) -> (Heads, f64) {
+fn trained(shape: HeadShape, threads: usize, steps: u64) -> (Heads, f64) {
     let (sources, targets) = random_rays(200, 8);
-    let mut heads = Heads::zeros(shape());
+    let targets = if shape.scales.is_some() { with_pyramid(targets, 8) } else { targets };
+    let mut heads = Heads::zeros(shape);
     heads.init(4);
     let mut optimiser = HeadOptimiser::new(&heads);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -225,8 +267,10 @@ fn trained(threads: usize, steps: u64) -> (Heads, f64) {
 
 #[test]
 fn training_does_not_depend_on_the_number_of_threads() {
-    let [(one, _), (three, _)] = [1, 3].map(|threads| trained(threads, 20));
-    assert_eq!((one.weights, one.tables), (three.weights, three.tables));
+    for shape in [shape(), scaled_shape()] {
+        let [(one, _), (three, _)] = [1, 3].map(|threads| trained(shape.clone(), threads, 20));
+        assert_eq!((one.weights, one.tables), (three.weights, three.tables));
+    }
 }
 
 #[test]
@@ -253,7 +297,7 @@ fn what_moves_is_learned_where_it_is_at_each_time() {
     let model = HeadModel::new(&heads, Precision::F32);
     let at = |time| {
         let mut out = vec![0.0; 4];
-        model.features(Stream::Dynamic, &[place], time, &mut out);
+        model.features(Stream::Dynamic, &[place], time, 0.0, &mut out);
         out[0]
     };
     assert!((at(0.1) - 1.0).abs() < 0.05 && (at(0.9) + 1.0).abs() < 0.05, "{} {}", at(0.1), at(0.9));
@@ -261,7 +305,7 @@ fn what_moves_is_learned_where_it_is_at_each_time() {
     let still = HeadShape { streams: [true, false, false], ..shape_of(&heads) };
     let heads = Heads::zeros(still);
     let model = HeadModel::new(&heads, Precision::F32);
-    model.features(Stream::Dynamic, &[place], 0.1, &mut nothing);
+    model.features(Stream::Dynamic, &[place], 0.1, 0.0, &mut nothing);
     assert_eq!(nothing, [0.0; 4], "a stream that is not there has no feature");
 }
 
@@ -285,6 +329,7 @@ fn descriptors_of_mixtures_are_taken_apart() {
         usable: (0..8).collect(),
         times: vec![0.5; 8],
         bags,
+        pyramid: None,
     };
     let sources = Sources::of_rays(rays);
     let mut heads = Heads::zeros(shape);
@@ -296,8 +341,82 @@ fn descriptors_of_mixtures_are_taken_apart() {
     }
     let model = HeadModel::new(&heads, Precision::F32);
     let mut out = vec![0.0; 8];
-    model.features(Stream::Persistent, &places, 0.5, &mut out);
+    model.features(Stream::Persistent, &places, 0.5, 0.0, &mut out);
     assert!(out[0] > 0.75 && out[4] < -0.75, "{} {}", out[0], out[4]);
+}
+
+#[test]
+fn what_depends_on_size_is_learned_at_every_distance() {
+    // One place seen from two distances: patches that show more than 0.3 units are one thing, smaller ones another.
+    let place = Vec3::new(0.3, 0.4, 0.2);
+    let rays = (0..64).map(|_| vec![(1.0, Stream::Persistent as u8, place)]).collect();
+    let heights: Vec<f32> = (0..64).map(|n| if n % 2 == 0 { 1.0 } else { 2.0 }).collect();
+    let knots: Vec<f32> = (1..=8).map(|n| 0.075 * n as f32).collect();
+    let of = |size: f32| if size > 0.31 { 1.0 } else { -1.0 };
+    let values = heights.iter().flat_map(|h| knots.iter().map(move |k| [of(k * h), 0.0, 0.0, 0.0])).flatten();
+    let targets = RayTargets {
+        width: 4,
+        dim: 4,
+        values: values.map(f16::from_f32).collect(),
+        weights: vec![[1.0, 0.0]; 64],
+        usable: (0..64).collect(),
+        times: vec![0.5; 64],
+        bags: Bags::default(),
+        pyramid: Some(Pyramid { knots, shares: vec![[0.075, 0.6]; 64], heights }),
+    };
+    let range = targets.pyramid.as_ref().unwrap().sizes(&targets.usable);
+    assert_eq!(range, [0.075, 1.2]);
+    let shape = HeadShape { dim: 4, parts: 0, scales: Some(range), ..shape() };
+    let sources = Sources::of_rays(rays);
+    let mut heads = Heads::zeros(shape.clone());
+    heads.init(1);
+    let mut optimiser = HeadOptimiser::new(&heads);
+    for step in 1..=400 {
+        optimiser.step(&mut heads, &sources, &targets, &plan(step));
+    }
+    let model = HeadModel::new(&heads, Precision::F32);
+    let at = |size| {
+        let mut out = vec![0.0; 4];
+        model.features(Stream::Persistent, &[place], 0.5, size, &mut out);
+        // Sources keep positions to a 65535th.
+        let rendered = render_features(&model, &sources, 0.5, |_| size).values[0];
+        assert!((rendered - out[0]).abs() < 1e-3, "one source alone: {rendered}, {}", out[0]);
+        out[0]
+    };
+    for size in [0.08, 0.15, 0.2, 0.5, 0.8, 1.1] {
+        assert!((at(size) - of(size)).abs() < 0.25, "{size}: {}", at(size));
+    }
+    let tried = shape.other_sizes(5);
+    assert!(tried.len() == 4 && tried[0] == range[0] && (tried[3] - range[1]).abs() < 1e-5, "{tried:?}");
+    assert!(shape.middle_size() > tried[1] && shape.middle_size() < tried[2], "it is not tried twice");
+}
+
+#[test]
+fn fields_without_scales_know_nothing_of_them() {
+    let plain = shape();
+    let json = serde_json::to_string(&plain).unwrap();
+    assert!(!json.contains("scales"), "files are what they were: {json}");
+    assert_eq!(serde_json::from_str::<HeadShape>(&json).unwrap(), plain);
+    let scaled = serde_json::to_string(&scaled_shape()).unwrap();
+    assert_eq!(serde_json::from_str::<HeadShape>(&scaled).unwrap(), scaled_shape());
+    assert!(plain.other_sizes(9).is_empty());
+    for (stream, net) in Stream::ALL.into_iter().zip(&Heads::zeros(plain.clone()).nets) {
+        assert_eq!(net.as_ref().unwrap().mlp.widths()[0], plain.grid(stream).width());
+    }
+    // A pyramid whose scales are all alike teaches them the same, bit by bit: drawing disturbs no other number.
+    let (sources, targets) = random_rays(200, 8);
+    let pyramid = Pyramid { knots: vec![0.3], shares: vec![[0.3; 2]; 200], heights: vec![1.0; 200] };
+    let drawn = RayTargets { pyramid: Some(pyramid), ..targets.clone() };
+    let [one, two] = [targets, drawn].map(|targets| {
+        let mut heads = Heads::zeros(shape());
+        heads.init(4);
+        let mut optimiser = HeadOptimiser::new(&heads);
+        for step in 1..=5 {
+            optimiser.step(&mut heads, &sources, &targets, &plan(step));
+        }
+        (heads.weights, heads.tables)
+    });
+    assert_eq!(one, two);
 }
 
 fn shape_of(heads: &Heads) -> HeadShape {

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 
 use super::cache::Sources;
 use super::render::pixel_ray;
+use super::scale::pyramid_targets;
 use super::step::{Bags, HeadOptimiser, HeadStep, JointPlan, RayTargets};
 use super::{HeadShape, Heads};
 use crate::config::Config;
@@ -22,7 +23,7 @@ use crate::semantics::compress::{CompressConfig, Compressor};
 use crate::semantics::config::SemanticsConfig;
 use crate::semantics::error::SemanticsError;
 use crate::semantics::fields::{SemanticFields, SpaceField};
-use crate::semantics::targets::{EncodedTable, ImageTargets, PartTargets, VideoTargets};
+use crate::semantics::targets::{EncodedTable, ImageMode, ImageTargets, PartTargets, VideoTargets};
 use crate::train::{Trained, Trainer, step};
 
 /// Streams of random numbers: which pixels are kept, and the steps of each space.
@@ -56,10 +57,10 @@ pub struct HeadProgress {
 
 /// A pixel of the cache.
 #[derive(Clone, Copy)]
-struct Pixel {
-    frame: u32,
-    x: u32,
-    y: u32,
+pub(super) struct Pixel {
+    pub frame: u32,
+    pub x: u32,
+    pub y: u32,
 }
 
 /// Targets of all spaces, for the training frames.
@@ -131,7 +132,7 @@ pub fn train_features(
     let mut spaces = Vec::new();
     for space in Space::ALL {
         let trainer = match space {
-            Space::Clip => SpaceTrainer::image(&targets, &pixels, &frames, config)?,
+            Space::Clip => SpaceTrainer::image(&targets, &pixels, &frames, &sources, config)?,
             Space::Egovideo => SpaceTrainer::video(&targets, &pixels, &frames, config)?,
         };
         match trainer {
@@ -300,13 +301,14 @@ struct SpaceTrainer {
 }
 
 /// Target of one pixel: what it adds to `[width]` and the weights of its two parts.
-type Target = Option<(Vec<f32>, [f32; 2])>;
+pub(super) type Target = Option<(Vec<f32>, [f32; 2])>;
 
 impl SpaceTrainer {
     fn image(
         targets: &Targets,
         pixels: &[Pixel],
         frames: &[Frame],
+        sources: &Sources,
         config: &Config,
     ) -> Result<Option<Self>, SemanticsError> {
         let Some(image) = &targets.image else { return Ok(None) };
@@ -319,7 +321,10 @@ impl SpaceTrainer {
             encoded.blend(&blend, &mut z);
             Some((z, [1.0, 0.0]))
         };
-        let targets = gather(pixels, frames, dim, dim, of);
+        let targets = match config.semantics.image.mode {
+            ImageMode::ScaledPatches => pyramid_targets(image, &encoded, pixels, frames, &sources.depth),
+            _ => gather(pixels, frames, dim, dim, of),
+        };
         let frames = image.frames().count();
         Ok((!targets.usable.is_empty()).then_some(Self { compressor, targets, parts: 0, frames }))
     }
@@ -389,7 +394,8 @@ impl SpaceTrainer {
         targets.usable.retain(seen);
         targets.bags = targets.bags.only(targets.dim, seen);
         let settings = &config.semantics;
-        let shape = HeadShape::new(settings, &trained.field.shape, frames, compressor.dim(), parts);
+        let mut shape = HeadShape::new(settings, &trained.field.shape, frames, compressor.dim(), parts);
+        shape.scales = targets.pyramid.as_ref().map(|p| p.sizes(&targets.usable));
         let mut heads = Heads::zeros(shape);
         heads.init(config.seed.wrapping_add(space as u64));
         let optimiser = HeadOptimiser::new(&heads);
@@ -459,7 +465,7 @@ fn bags(video: &VideoTargets, encoded: &EncodedTable, pixels: &[Pixel]) -> Bags 
 }
 
 /// The targets of all pixels as one table.
-fn gather(
+pub(super) fn gather(
     pixels: &[Pixel],
     frames: &[Frame],
     width: usize,
@@ -478,5 +484,5 @@ fn gather(
         .collect();
     let usable = (0..pixels.len() as u32).filter(|n| weights[*n as usize][0] > 0.0).collect();
     let times = pixels.iter().map(|p| frames[p.frame as usize].time as f32).collect();
-    RayTargets { width, dim, values, weights, usable, times, bags: Bags::default() }
+    RayTargets { width, dim, values, weights, usable, times, ..RayTargets::default() }
 }

@@ -233,6 +233,30 @@ impl Queries {
         }
     }
 
+    /// Scores of points whose features depend on a size: for each phrase those at the size where it is highest at any
+    /// point (LERF, 3.3). `points` are the features at one size, `at` gives those at each of `others`.
+    ///
+    /// # Errors
+    /// As [`Self::score`].
+    pub fn best_scores(
+        &self,
+        points: &[f32],
+        others: &[f32],
+        at: impl Fn(f32) -> Vec<f32>,
+    ) -> Result<Vec<Vec<f32>>, RelevancyError> {
+        let top = |scores: &[f32]| scores.iter().copied().fold(0.0, f32::max);
+        let mut best = self.score(Points::F32(points))?.scores;
+        for size in others {
+            let found = self.score(Points::F32(&at(*size)))?.scores;
+            for (best, found) in best.iter_mut().zip(found) {
+                if top(&found) > top(best) {
+                    *best = found;
+                }
+            }
+        }
+        Ok(best)
+    }
+
     /// For compressors that phrases cannot be projected into.
     fn decode_and_score(
         &self,

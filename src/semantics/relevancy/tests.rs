@@ -205,3 +205,18 @@ fn relevancy_of_a_million_points_in_time() {
         eprintln!("1 M × {dim}, {}: {ms:.1} ms (bar {bar_ms} ms)", if half { "f16" } else { "f32" });
     }
 }
+
+#[test]
+fn each_phrase_has_the_scores_of_its_best_size() {
+    let axis = |n: usize| -> Vec<f32> { (0..4).map(|k| f32::from(u8::from(k == n))).collect() };
+    let (cup, table, stuff) = (axis(0), axis(1), axis(2));
+    let queries = Queries::new(Space::Clip, &[&cup, &table], &[&stuff], 10.0).unwrap();
+    // Two points: stuff at the middle size; small patches at the second show the cup, large ones the table everywhere.
+    let middle = [&stuff[..], &stuff].concat();
+    let at = |size: f32| if size < 1.0 { [&stuff[..], &cup].concat() } else { [&table[..], &table].concat() };
+    let best = queries.best_scores(&middle, &[0.5, 2.0], at).unwrap();
+    assert!(best[0][0] < 0.01 && best[0][1] > 0.99, "{best:?}");
+    assert!(best[1][0] > 0.99 && best[1][1] > 0.99, "{best:?}");
+    let alone = queries.best_scores(&middle, &[], |_| panic!("no other size")).unwrap();
+    assert_eq!(alone, queries.score(Points::F32(&middle)).unwrap().scores);
+}

@@ -128,6 +128,23 @@ impl ImageTargets {
         Some([grids.first()?.1.layout.scale(), grids.last()?.1.layout.scale()])
     }
 
+    /// Scales of the patches of all frames, ascending; evenly spread ones over the same range where there are more than
+    /// `most`, as with pictures of many sizes.
+    pub fn all_scales(&self, most: usize) -> Vec<f32> {
+        let grids = self.frames.iter().flatten().flat_map(|source| match source {
+            Source::Patches(grids) => &grids[..],
+            Source::Masks { .. } => &[],
+        });
+        let mut scales: Vec<f32> = grids.map(|g| g.1.layout.scale()).collect();
+        scales.sort_by(f32::total_cmp);
+        scales.dedup_by(|a, b| *a - *b < 1e-3);
+        if let (true, [low, .., high]) = (scales.len() > most, &scales[..]) {
+            let step = (high - low) / (most - 1) as f32;
+            scales = (0..most).map(|n| low + n as f32 * step).collect();
+        }
+        scales
+    }
+
     /// [`Self::at`] for patches of one scale, between the two nearest scales that the frame has (LERF's pyramid).
     ///
     /// Outside their range the nearest one counts. Without patches, the same as [`Self::at`].

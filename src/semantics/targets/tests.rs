@@ -101,6 +101,8 @@ fn a_scale_between_two_takes_from_both() {
     let scene = FeatureScene::new();
     let targets = image(&scene, ImageMode::ScaledPatches);
     assert_eq!(targets.scales(0), Some([0.5, 1.0]));
+    assert_eq!(targets.all_scales(8), [0.5, 1.0]);
+    assert_eq!(image(&scene, ImageMode::Masks).all_scales(8), [0.0; 0]);
     let at = |scale: f32| value(&targets.table, targets.at_scale(0, 0, 3, scale).unwrap());
     assert_near(at(0.5), axis(0));
     assert_near(at(0.1), axis(0));

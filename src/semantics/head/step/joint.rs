@@ -114,7 +114,7 @@ impl WithSimd for AskPass<'_> {
         for (out, batch) in outputs.iter_mut().zip(&group.batches) {
             out.resize(batch.tiles().len() * TILE * width, 0.0);
         }
-        group.render(simd, model, width, |s, tile, rows| {
+        group.render(simd, model, targets, |s, tile, rows| {
             outputs[s][tile * TILE * width..][..TILE * width].copy_from_slice(&rows[..TILE * width]);
         });
         let rendered = group.rendered.clone();

@@ -94,6 +94,7 @@ fn targets(bagged: bool) -> RayTargets {
         usable: (0..CHUNK_RAYS as u32).collect(),
         times: vec![0.0; CHUNK_RAYS],
         bags,
+        pyramid: None,
     }
 }
 
@@ -124,7 +125,7 @@ fn features(heads: &Heads, traced: &Chunk) -> Vec<Lit> {
     for (s, batch) in traced.batches.iter().enumerate() {
         let (numbers, points): (Vec<usize>, Vec<Vec3>) = batch.points().unzip();
         let mut out = vec![0.0; points.len() * WIDTH];
-        model.features(Stream::ALL[s], &points, 0.0, &mut out);
+        model.features(Stream::ALL[s], &points, 0.0, 0.0, &mut out);
         let samples = numbers.iter().zip(out.chunks_exact(WIDTH));
         lit.extend(samples.map(|(k, f)| (k / SAMPLES, *k, s, f.to_vec())));
     }
