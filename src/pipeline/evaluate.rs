@@ -96,7 +96,7 @@ pub fn evaluate(
     if observer.stop() {
         return Ok(None);
     }
-    semantic.fill_in(&mut quality, &model, &sampling)?;
+    let compression = semantic.fill_in(&mut quality, &model, &sampling)?;
     let mut skipped = skipped_in_training(&trained.progress, trained.field.shape.streams);
     let reasons = fields.map(|f| f.skipped.iter().map(|(what, why)| (what.clone(), why.clone().into())));
     skipped.insert("features".to_owned(), serde_json::Value::Object(reasons.into_iter().flatten().collect()));
@@ -114,7 +114,7 @@ pub fn evaluate(
     cost.set_training(&trained.progress);
     cost.eval_seconds = Some(start.elapsed().as_secs_f64());
     cost.peak_rss_mb = peak_rss_mb();
-    Ok(Some(RunMetrics { quality, cost, skipped }))
+    Ok(Some(RunMetrics { quality, cost, compression, skipped }))
 }
 
 /// What is measured of a frame: the colours as 8-bit PNGs hold them.

@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::eval::Metrics;
+use crate::semantics::agreement::Compression;
 use crate::train::checkpoint::TrainingState;
 
 /// Everything in `metrics.json`; what was not measured is left out.
@@ -17,6 +18,9 @@ pub struct RunMetrics {
     /// What it took.
     #[serde(flatten)]
     pub cost: Cost,
+    /// What compressing the descriptors of each space loses.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub compression: BTreeMap<String, Compression>,
     /// What was skipped and the work that it saved.
     #[serde(default)]
     pub skipped: BTreeMap<String, serde_json::Value>,

@@ -1,5 +1,6 @@
 //! The fields of features of a run: trained once for a geometry and some settings.
 
+use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::time::Instant;
 
@@ -12,7 +13,7 @@ use crate::render::forward::Model;
 use crate::render::sampler::Sampling;
 use crate::scene::features::Space;
 use crate::scene::{Frame, Scene, Split};
-use crate::semantics::agreement::feature_cosines;
+use crate::semantics::agreement::{Compression, compression, feature_cosines};
 use crate::semantics::head::train;
 use crate::semantics::layers::FeatureLayers;
 use crate::semantics::{SemanticFields, SemanticsError, TextSources};
@@ -125,15 +126,15 @@ impl<'a> SemanticEvaluation<'a> {
         Ok(found.channels())
     }
 
-    /// Puts the measures in their place.
+    /// Puts the measures in their place; what compression loses.
     pub(super) fn fill_in(
         self,
         metrics: &mut Metrics,
         model: &Model,
         sampling: &Sampling,
-    ) -> Result<(), PipelineError> {
+    ) -> Result<BTreeMap<String, Compression>, PipelineError> {
         self.sums.fill_in(metrics, self.why);
-        let Some(fields) = self.fields else { return Ok(()) };
+        let Some(fields) = self.fields else { return Ok(BTreeMap::new()) };
         let cosines = feature_cosines(self.scene, model, fields, &self.config.semantics, sampling)?;
         for (space, found) in Space::ALL.into_iter().zip(cosines) {
             let name = format!("feature_cosine_{}", space.name());
@@ -150,6 +151,8 @@ impl<'a> SemanticEvaluation<'a> {
                 None => metrics.absent.insert(name, "no frame has features of this space".into()),
             };
         }
-        Ok(())
+        let compression = compression(self.scene, fields, &TextSources::of_scene(self.scene)?)?;
+        let named = Space::ALL.into_iter().zip(compression);
+        Ok(named.filter_map(|(space, c)| Some((space.name().to_owned(), c?))).collect())
     }
 }

@@ -1,13 +1,16 @@
 //! How well rendered features agree with what they were learned from.
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use super::compress::Compressor;
 use super::config::SemanticsConfig;
 use super::error::SemanticsError;
-use super::fields::SemanticFields;
+use super::fields::{SemanticFields, SpaceField};
 use super::head::{HeadModel, render_features, trace_frame};
+use super::relevancy::Points;
 use super::targets::{ImageTargets, TargetTable, VideoTargets};
+use super::text_source::TextSources;
 use crate::field::mlp::Precision;
 use crate::render::forward::Model;
 use crate::render::sampler::Sampling;
@@ -19,6 +22,12 @@ const FRAMES: usize = 24;
 
 /// Scale at which fields with scales are compared, as a share of the image's height: the middle of LERF's pyramid.
 const SHARE: f32 = 1.0 / 3.0;
+
+/// Phrases that compressed descriptors are asked.
+const PHRASES: usize = 256;
+
+/// A descriptor answers a phrase where its relevancy is above this.
+const ANSWERS: f32 = 0.5;
 
 /// Every so many pixels along a frame's rows and columns.
 const STRIDE: u32 = 4;
@@ -39,8 +48,7 @@ pub fn feature_cosines(
     let mut found = [None, None];
     for split in [Split::Test, Split::Train] {
         let all: Vec<&Frame> = scene.frames.iter().filter(|f| f.split == split).collect();
-        let count = all.len().min(FRAMES);
-        let frames: Vec<Frame> = (0..count).map(|n| all[n * all.len() / count].clone()).collect();
+        let frames: Vec<Frame> = spread(&all).cloned().collect();
         for (n, field) in fields.spaces.iter().enumerate() {
             let (Some(field), None) = (field, found[n]) else { continue };
             let heads = HeadModel::new(&field.heads, Precision::F32);
@@ -66,6 +74,81 @@ pub fn feature_cosines(
         }
     }
     Ok(found)
+}
+
+/// What compressing the descriptors of a space loses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Compression {
+    /// Numbers per compressed descriptor.
+    pub dimensions: usize,
+    /// Numbers per descriptor of the scene.
+    pub of: usize,
+    /// 1 − mean cosine between descriptors and what comes back of them.
+    pub cosine_error: f64,
+    /// Mean over phrases of the IoU of the descriptors that answer them compressed with those that do as they are;
+    /// `None` where no phrase is known that any of them answers.
+    pub answers_iou: Option<f64>,
+}
+
+/// What compression loses for each space, over descriptors of training frames and phrases that are known without an
+/// encoder.
+///
+/// # Errors
+/// Features or phrases that cannot be used.
+pub fn compression(
+    scene: &Scene,
+    fields: &SemanticFields,
+    text: &TextSources,
+) -> Result<[Option<Compression>; 2], SemanticsError> {
+    let (store, config) = (FeatureStore::open(scene)?, &fields.config);
+    let all: Vec<&Frame> = scene.frames.iter().filter(|f| f.split == Split::Train).collect();
+    let frames: Vec<Frame> = spread(&all).cloned().collect();
+    let mut found = [None, None];
+    for field in fields.spaces.iter().flatten() {
+        let table = match field.space {
+            Space::Clip => ImageTargets::load(&store, &frames, config.image)?.map(|t| t.table),
+            Space::Egovideo => VideoTargets::load(&store, &frames, config.video)?.map(|t| t.table),
+        };
+        let answers_iou = match table {
+            Some(table) => answers_iou(&table, field, text, config.temperature)?,
+            None => None,
+        };
+        let compressor = &field.compressor;
+        let (dimensions, of, cosine_error) = (compressor.dim(), compressor.full(), compressor.error);
+        found[field.space as usize] = Some(Compression { dimensions, of, cosine_error, answers_iou });
+    }
+    Ok(found)
+}
+
+fn answers_iou(
+    table: &TargetTable,
+    field: &SpaceField,
+    text: &TextSources,
+    temperature: f32,
+) -> Result<Option<f64>, SemanticsError> {
+    let (space, compressor) = (field.space, &field.compressor);
+    let phrases = text.phrases(space, PHRASES);
+    if phrases.is_empty() || text.canonical(space).is_empty() {
+        return Ok(None);
+    }
+    let rows = table.sample(usize::MAX);
+    let mut codes = vec![0.0; rows.len() / compressor.full() * compressor.dim()];
+    compressor.encode(&rows, &mut codes);
+    let whole = text.plain_queries(space, &phrases, temperature)?.score(Points::F32(&rows))?.scores;
+    let short = text.queries(space, compressor, &phrases, temperature)?.score(Points::F32(&codes))?.scores;
+    let iou = |(a, b): (&Vec<f32>, &Vec<f32>)| {
+        let pairs = || a.iter().zip(b).map(|(a, b)| (*a > ANSWERS, *b > ANSWERS));
+        let (both, any) = (pairs().filter(|p| p.0 && p.1).count(), pairs().filter(|p| p.0 || p.1).count());
+        (any > 0).then(|| both as f64 / any as f64)
+    };
+    let ious: Vec<f64> = whole.iter().zip(&short).filter_map(iou).collect();
+    Ok((!ious.is_empty()).then(|| ious.iter().sum::<f64>() / ious.len() as f64))
+}
+
+/// At most [`FRAMES`] of a list, evenly spread.
+fn spread<'a>(all: &'a [&'a Frame]) -> impl Iterator<Item = &'a Frame> {
+    let count = all.len().min(FRAMES);
+    (0..count).map(move |n| all[n * all.len() / count])
 }
 
 struct Compared<'a> {

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::compress::Compressor;
 use super::error::SemanticsError;
-use super::relevancy::Queries;
+use super::relevancy::{Queries, RelevancyError};
 use super::text::{TextError, TextSource};
 use crate::scene::Scene;
 use crate::scene::features::{FeatureStore, Space};
@@ -85,12 +85,38 @@ impl TextSources {
         phrases: &[String],
         temperature: f32,
     ) -> Result<Queries, SemanticsError> {
+        self.with_embeddings(space, phrases, |wanted, canonical| {
+            Queries::compressed(space, compressor, wanted, canonical, temperature)
+        })
+    }
+
+    /// Phrases ready to be held against descriptors as they are.
+    ///
+    /// # Errors
+    /// As [`Self::queries`].
+    pub fn plain_queries(
+        &self,
+        space: Space,
+        phrases: &[String],
+        temperature: f32,
+    ) -> Result<Queries, SemanticsError> {
+        self.with_embeddings(space, phrases, |wanted, canonical| {
+            Queries::new(space, wanted, canonical, temperature)
+        })
+    }
+
+    fn with_embeddings(
+        &self,
+        space: Space,
+        phrases: &[String],
+        queries: impl FnOnce(&[&[f32]], &[&[f32]]) -> Result<Queries, RelevancyError>,
+    ) -> Result<Queries, SemanticsError> {
         let wanted: Vec<Vec<f32>> =
             phrases.iter().map(|p| self.embedding(space, p)).collect::<Result<_, _>>()?;
         let canonical = self.canonical(space);
         let wanted: Vec<&[f32]> = wanted.iter().map(Vec::as_slice).collect();
         let canonical: Vec<&[f32]> = canonical.iter().map(Vec::as_slice).collect();
-        Ok(Queries::compressed(space, compressor, &wanted, &canonical, temperature)?)
+        Ok(queries(&wanted, &canonical)?)
     }
 
     /// Embeddings of the canonical phrases that are known.
