@@ -72,9 +72,11 @@ impl Variant {
     /// `config` with what makes the difference.
     fn settings(self, config: &Config) -> Config {
         let mut config = config.clone();
-        if self == Self::Static {
-            config.train.streams = StreamChoice::Static;
-        }
+        config.train.streams = match (self, config.train.streams) {
+            (Self::Static, _) => StreamChoice::Static,
+            (_, StreamChoice::Static) => StreamChoice::All,
+            (_, asked) => asked,
+        };
         config.semantics.image.mode = match self {
             Self::Static => ImageMode::ScaledPatches,
             Self::Patches => ImageMode::Patches,
@@ -94,6 +96,8 @@ struct Geometry {
 /// Trains what the rows need, in `out`, and measures them; rows come in the paper's order. `None` if the observer said
 /// stop: the same call goes on from there.
 ///
+/// `base` holds the settings that all rows have in common.
+///
 /// A row whose phrases do not all have an embedding in `text` has no figure and says so: means over different phrases
 /// could not be compared.
 ///
@@ -101,7 +105,7 @@ struct Geometry {
 /// [`PipelineError`]: the first thing that went wrong; what was finished before it stays.
 pub fn paper_tables(
     scene: &Scene,
-    config: &Config,
+    base: &Config,
     out: &Path,
     variants: &[Variant],
     detections: &[Detections],
@@ -113,7 +117,7 @@ pub fn paper_tables(
     // Per task: variant (none for detections), space and row.
     let mut found: [Vec<(Option<Variant>, Space, TableRow)>; 2] = Default::default();
     for variant in Variant::ALL.into_iter().filter(|v| variants.contains(v)) {
-        let config = variant.settings(config);
+        let config = variant.settings(base);
         let run = RunFolder::new(out.join(variant.name()));
         let own;
         let geometry = if variant == Variant::Static {
@@ -121,6 +125,8 @@ pub fn paper_tables(
             own.as_ref()
         } else {
             if shared.is_none() {
+                // The same record whichever row comes first.
+                let config = Variant::MasksAndBoxes.settings(base);
                 shared = geometry(scene, &config, &RunFolder::new(out.join("geometry")), observer)?;
             }
             shared.as_ref()

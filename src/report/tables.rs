@@ -170,7 +170,7 @@ fn table(rows: &[TableRow]) -> String {
         out.push('\n');
     }
     notes.for_each(|(method, why)| {
-        let _ = writeln!(out, "- {method}: no figure, for {why}.");
+        let _ = writeln!(out, "- {method}: no figure: {why}.");
     });
     out
 }
@@ -242,7 +242,7 @@ mod tests {
 | B | 12.5 | **25.0** | **50.0** | 24.31 | 530 | 70 |
 | C | – | – | – | – | – | – |
 
-- C: no figure, for there is no text.
+- C: no figure: there is no text.
 
 ## Affordance segmentation
 ";
