@@ -94,6 +94,32 @@ impl Config {
         all.try_into().map_err(|e: toml::de::Error| syntax(e.to_string()))
     }
 
+    /// These settings with one of them changed: `train.steps=9000`. A value that is not TOML is taken as a string:
+    /// `train.streams=static`.
+    ///
+    /// # Errors
+    /// [`ConfigError::Syntax`], in one line, for text without `=`, unknown keys and wrong types.
+    pub fn with_setting(&self, setting: &str) -> Result<Self, ConfigError> {
+        let origin = format!("--set {setting}");
+        let Some((key, value)) = setting.split_once('=') else {
+            let message = "there is no `=` in it; write it as --set train.steps=9000".to_owned();
+            return Err(ConfigError::Syntax { origin, message });
+        };
+        let (key, value) = (key.trim(), value.trim());
+        let as_is = format!("{key} = {value}");
+        let text = match as_is.parse::<toml::Table>() {
+            Ok(_) => as_is,
+            Err(_) => format!("{key} = {}", toml::Value::String(value.to_owned())),
+        };
+        self.overlaid(&text, &origin).map_err(|error| match error {
+            // The parser's picture of the line only repeats what was typed.
+            ConfigError::Syntax { origin, message } => {
+                ConfigError::Syntax { origin, message: message.lines().last().unwrap_or_default().to_owned() }
+            }
+            other => other,
+        })
+    }
+
     /// As TOML, as it stands in `config.toml`.
     pub fn to_toml(&self) -> String {
         toml::to_string_pretty(self).unwrap_or_else(|e| unreachable!("plain data is TOML: {e}"))

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use divff::config::{Config, ConfigError, Preset};
+use divff::config::{Config, Preset};
 
 use super::args::{PresetArg, SettingsArgs};
 use super::error::CliError;
@@ -29,7 +29,7 @@ pub fn resolve(args: &SettingsArgs) -> Result<Config, CliError> {
         config = config.overlaid(&text, &path.display().to_string())?;
     }
     for setting in &args.set {
-        config = set(&config, setting)?;
+        config = config.with_setting(setting)?;
     }
     if let Some(seed) = args.seed {
         config.seed = seed;
@@ -45,32 +45,6 @@ pub fn resolve(args: &SettingsArgs) -> Result<Config, CliError> {
     Ok(config)
 }
 
-/// Lays `key=value` over the settings. A value that is not TOML is taken as a string: `train.streams=static`.
-fn set(config: &Config, setting: &str) -> Result<Config, CliError> {
-    let Some((key, value)) = setting.split_once('=') else {
-        return Err(CliError::Usage {
-            option: format!("--set {setting}"),
-            what: "there is no `=` in it".into(),
-            remedy: "write it as --set train.steps=9000",
-        });
-    };
-    let (key, value) = (key.trim(), value.trim());
-    let origin = format!("--set {setting}");
-    let as_is = format!("{key} = {value}");
-    let text = match as_is.parse::<toml::Table>() {
-        Ok(_) => as_is,
-        Err(_) => format!("{key} = {}", toml::Value::String(value.to_owned())),
-    };
-    config.overlaid(&text, &origin).map_err(|error| match error {
-        // The parser's picture of the line only repeats what was typed.
-        ConfigError::Syntax { origin, message } => {
-            let message = message.lines().last().unwrap_or_default().to_owned();
-            CliError::from(ConfigError::Syntax { origin, message })
-        }
-        other => other.into(),
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use divff::train::StreamChoice;
@@ -80,16 +54,16 @@ mod tests {
     #[test]
     fn values_are_toml_or_bare_strings() {
         let config = Config::default();
-        assert_eq!(set(&config, "train.steps=12").unwrap().train.steps, 12);
-        assert_eq!(set(&config, "train.streams=static").unwrap().train.streams, StreamChoice::Static);
-        assert_eq!(set(&config, "train.streams=\"all\"").unwrap().train.streams, StreamChoice::All);
-        assert_eq!(set(&config, "train.explore=[0.25, 0.5]").unwrap().train.explore, [0.25, 0.5]);
+        assert_eq!(config.with_setting("train.steps=12").unwrap().train.steps, 12);
+        assert_eq!(config.with_setting("train.streams=static").unwrap().train.streams, StreamChoice::Static);
+        assert_eq!(config.with_setting("train.streams=\"all\"").unwrap().train.streams, StreamChoice::All);
+        assert_eq!(config.with_setting("train.explore=[0.25, 0.5]").unwrap().train.explore, [0.25, 0.5]);
     }
 
     #[test]
     fn mistakes_name_the_option() {
         for wrong in ["train.steps", "train.stepz=1", "train.steps=many", "train=1", "=1"] {
-            let message = set(&Config::default(), wrong).unwrap_err().to_string();
+            let message = Config::default().with_setting(wrong).unwrap_err().to_string();
             assert!(message.contains(&format!("--set {wrong}")), "{message}");
             assert!(!message.contains('\n'), "{message}");
         }

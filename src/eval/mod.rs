@@ -5,6 +5,7 @@
 //! F-score). What has no truth to compare with is absent from [`Metrics`], with the reason in
 //! [`Metrics::absent`].
 
+pub mod detections;
 mod error;
 mod evaluate;
 mod images;
@@ -15,10 +16,12 @@ mod truth;
 
 use std::collections::BTreeMap;
 
+pub use detections::{DetectionError, Detections};
 pub use error::EvalError;
 pub use evaluate::{evaluate, evaluate_geometry, evaluate_images};
 pub use images::{ImageSums, RenderedView};
-pub use scores::{PhraseTruth, ScoreSums};
+pub(crate) use scores::NOTHING;
+pub use scores::{PhraseTruth, ScoreSums, THRESHOLD, Task};
 use serde::{Deserialize, Serialize};
 pub use ssim::ssim;
 

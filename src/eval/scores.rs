@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use image::DynamicImage;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::images::{check_size, mean};
@@ -11,11 +12,36 @@ use crate::error::FileError;
 use crate::scene::features::Space;
 use crate::scene::{Frame, Scene};
 
-/// A pixel belongs to a phrase where its score is above this, whatever the phrase.
-const THRESHOLD: f32 = 0.5;
+/// A pixel belongs to a phrase where its score is above this, whatever the phrase and whoever gives the score.
+pub const THRESHOLD: f32 = 0.5;
 
 /// An object or a region is scored in a frame where the truth covers at least so many pixels.
 const MIN_PIXELS: usize = 50;
+
+/// What phrases are to find; each task has a truth and a measure of its own, whichever features are asked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Task {
+    /// Dynamic objects that move, by their names.
+    Objects,
+    /// Where something can be done, by what is done there.
+    Affordances,
+}
+
+impl Task {
+    /// Both, in the order of [`Space::ALL`]: what each space is there for.
+    pub const ALL: [Self; 2] = [Self::Objects, Self::Affordances];
+
+    /// The space that is asked for the task's measure.
+    pub fn space(self) -> Space {
+        Space::ALL[self as usize]
+    }
+
+    /// Name of the task's measure in `metrics.json`.
+    pub fn measure(self) -> &'static str {
+        ["object_miou", "affordance_miou"][self as usize]
+    }
+}
 
 /// What phrases should find.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -45,12 +71,12 @@ impl PhraseTruth {
         Ok(Self { root, objects, affordances })
     }
 
-    /// The phrases to be asked in a space, each once.
-    pub fn phrases(&self, space: Space) -> Vec<String> {
+    /// The phrases of a task, each once.
+    pub fn phrases(&self, task: Task) -> Vec<String> {
         let mut phrases: Vec<String> = Vec::new();
-        let all: Vec<&String> = match space {
-            Space::Clip => self.objects.iter().map(|o| &o.1).collect(),
-            Space::Egovideo => self.affordances.iter().map(|a| &a.0).collect(),
+        let all: Vec<&String> = match task {
+            Task::Objects => self.objects.iter().map(|o| &o.1).collect(),
+            Task::Affordances => self.affordances.iter().map(|a| &a.0).collect(),
         };
         for phrase in all {
             if !phrases.contains(phrase) {
@@ -66,9 +92,9 @@ impl PhraseTruth {
     ///
     /// # Errors
     /// Truth that cannot be read, or of another size than the frame.
-    pub fn mask(&self, frame: &Frame, space: Space, phrase: &str) -> Result<Option<Vec<bool>>, EvalError> {
+    pub fn mask(&self, frame: &Frame, task: Task, phrase: &str) -> Result<Option<Vec<bool>>, EvalError> {
         let name = format!("{}.png", frame.stem);
-        if space == Space::Clip {
+        if task == Task::Objects {
             let of: Vec<u32> = self.objects.iter().filter(|o| o.1 == phrase).map(|o| o.0).collect();
             let instances = labels(&self.root.join("instances").join(&name), frame)?;
             return Ok(instances.map(|labels| labels.iter().map(|l| of.contains(l)).collect()));
@@ -123,44 +149,56 @@ fn affordances(value: &Value) -> Option<Vec<(String, String)>> {
     list.iter().map(one).collect()
 }
 
-/// IoUs over frames.
-#[derive(Clone, Debug, Default)]
+/// IoUs of one task over frames.
+#[derive(Clone, Debug)]
 pub struct ScoreSums {
-    ious: [Vec<f64>; 2],
+    task: Task,
+    /// Phrase and IoU of every object or region in every frame where the truth covers enough.
+    ious: Vec<(String, f64)>,
 }
 
 impl ScoreSums {
-    /// Compares the scores of one frame, `(space, phrase, [height * width])`, with the truth.
+    /// Nothing yet.
+    pub fn new(task: Task) -> Self {
+        Self { task, ious: Vec::new() }
+    }
+
+    /// Compares the scores of one frame with the truth; `scores` gives those of a phrase, `[height * width]`, or `None`
+    /// for a phrase that was not asked.
     ///
     /// # Errors
     /// [`EvalError::Size`] for scores or truth of another size than the frame, unreadable truth.
-    pub fn add(
+    pub fn add<'s>(
         &mut self,
         truth: &PhraseTruth,
         frame: &Frame,
-        scores: &[(Space, String, Vec<f32>)],
+        scores: impl Fn(&str) -> Option<&'s [f32]>,
     ) -> Result<(), EvalError> {
-        let of =
-            |space: Space, phrase: &str| scores.iter().find(|s| s.0 == space && s.1 == phrase).map(|s| &s.2);
         let name = format!("{}.png", frame.stem);
-        if let Some(instances) = labels(&truth.root.join("instances").join(&name), frame)? {
-            for (number, phrase) in &truth.objects {
-                let Some(scores) = of(Space::Clip, phrase) else { continue };
-                check_size(frame, "scores", scores.len())?;
-                self.add_mask(Space::Clip, scores, |n| instances[n] == *number);
+        match self.task {
+            Task::Objects => {
+                let path = truth.root.join("instances").join(&name);
+                let Some(instances) = labels(&path, frame)? else { return Ok(()) };
+                for (number, phrase) in &truth.objects {
+                    let Some(scores) = scores(phrase) else { continue };
+                    check_size(frame, "scores", scores.len())?;
+                    self.add_mask(phrase, scores, |n| instances[n] == *number);
+                }
             }
-        }
-        for (phrase, folder) in &truth.affordances {
-            let Some(scores) = of(Space::Egovideo, phrase) else { continue };
-            let path = truth.root.join("affordances").join(folder).join(&name);
-            let Some(mask) = labels(&path, frame)? else { continue };
-            check_size(frame, "scores", scores.len())?;
-            self.add_mask(Space::Egovideo, scores, |n| mask[n] > 127);
+            Task::Affordances => {
+                for (phrase, folder) in &truth.affordances {
+                    let Some(scores) = scores(phrase) else { continue };
+                    let path = truth.root.join("affordances").join(folder).join(&name);
+                    let Some(mask) = labels(&path, frame)? else { continue };
+                    check_size(frame, "scores", scores.len())?;
+                    self.add_mask(phrase, scores, |n| mask[n] > 127);
+                }
+            }
         }
         Ok(())
     }
 
-    fn add_mask(&mut self, space: Space, scores: &[f32], inside: impl Fn(usize) -> bool) {
+    fn add_mask(&mut self, phrase: &str, scores: &[f32], inside: impl Fn(usize) -> bool) {
         let (mut both, mut any, mut covered) = (0usize, 0usize, 0usize);
         for (n, score) in scores.iter().enumerate() {
             let (found, truth) = (*score > THRESHOLD, inside(n));
@@ -169,25 +207,35 @@ impl ScoreSums {
             covered += usize::from(truth);
         }
         if covered >= MIN_PIXELS {
-            self.ious[space as usize].push(both as f64 / any as f64);
+            self.ious.push((phrase.to_owned(), both as f64 / any as f64));
         }
     }
 
-    /// Fills in `object_miou` and `affordance_miou`, or why they are absent.
-    pub fn fill_in(&self, metrics: &mut Metrics, why: [Option<String>; 2]) {
-        let [objects, affordances] = self.ious.each_ref().map(|v| mean(v));
-        (metrics.object_miou, metrics.affordance_miou) = (objects, affordances);
-        for ((name, value), why) in
-            [("object_miou", objects), ("affordance_miou", affordances)].into_iter().zip(why)
-        {
-            if value.is_none() {
-                let why =
-                    why.unwrap_or_else(|| "no true mask of a phrase covers 50 px in a test frame".into());
-                metrics.absent.insert(name.into(), why);
-            }
+    /// Mean over all objects or regions and frames: the task's measure. `None` where nothing was large enough.
+    pub fn mean(&self) -> Option<f64> {
+        mean(&self.ious.iter().map(|i| i.1).collect::<Vec<_>>())
+    }
+
+    /// Mean over the frames of one phrase.
+    pub fn mean_of(&self, phrase: &str) -> Option<f64> {
+        mean(&self.ious.iter().filter(|i| i.0 == phrase).map(|i| i.1).collect::<Vec<_>>())
+    }
+
+    /// Fills in the task's measure, or why it is absent.
+    pub fn fill_in(&self, metrics: &mut Metrics, why: Option<String>) {
+        let value = self.mean();
+        match self.task {
+            Task::Objects => metrics.object_miou = value,
+            Task::Affordances => metrics.affordance_miou = value,
+        }
+        if value.is_none() {
+            metrics.absent.insert(self.task.measure().into(), why.unwrap_or_else(|| NOTHING.into()));
         }
     }
 }
+
+/// Why a task that was asked has no measure.
+pub(crate) const NOTHING: &str = "no true mask of a phrase covers 50 px in a test frame";
 
 /// Labels of a frame, 8 or 16 bits; `None` without such a file.
 fn labels(path: &Path, frame: &Frame) -> Result<Option<Vec<u32>>, EvalError> {
@@ -219,7 +267,7 @@ mod tests {
         let found = objects(&serde_json::from_str(text).unwrap()).unwrap();
         assert_eq!(found, [(3, "mug".into()), (12, "mug".into())]);
         let truth = PhraseTruth { objects: found, ..PhraseTruth::default() };
-        assert_eq!(truth.phrases(Space::Clip), ["mug"]);
+        assert_eq!(truth.phrases(Task::Objects), ["mug"]);
         assert_eq!(objects(&serde_json::json!({"x": {}})), None);
     }
 
@@ -257,14 +305,15 @@ mod tests {
         // Half of the mug and 10 pixels beside it are found; exactly 0.5 does not count.
         let score = |n: usize| if (30..70).contains(&n) { 0.6 } else { 0.5 };
         let scores: Vec<f32> = (0..200).map(score).collect();
-        let all = [(Space::Clip, "mug".to_owned(), scores.clone()), (Space::Clip, "pan".to_owned(), scores)];
-        let mut sums = ScoreSums::default();
-        sums.add(&truth, &f, &all).unwrap();
+        let mut sums = ScoreSums::new(Task::Objects);
+        sums.add(&truth, &f, |_| Some(&scores)).unwrap();
+        assert_eq!(sums.mean(), sums.mean_of("mug"), "the pan is too small to count");
+        assert_eq!(sums.mean_of("pan"), None);
         let mut metrics = Metrics::default();
-        sums.fill_in(&mut metrics, [None, Some("no video features".into())]);
+        sums.fill_in(&mut metrics, None);
+        ScoreSums::new(Task::Affordances).fill_in(&mut metrics, Some("no video features".into()));
         assert!((metrics.object_miou.unwrap() - 30.0 / 70.0).abs() < 1e-12, "{:?}", metrics.object_miou);
         assert_eq!(metrics.absent["affordance_miou"], "no video features");
-        let short = [(Space::Clip, "mug".to_owned(), vec![0.0; 3])];
-        assert!(matches!(sums.add(&truth, &f, &short), Err(EvalError::Size { .. })));
+        assert!(matches!(sums.add(&truth, &f, |_| Some(&[0.0; 3])), Err(EvalError::Size { .. })));
     }
 }

@@ -118,7 +118,7 @@ pub fn evaluate(
 }
 
 /// What is measured of a frame: the colours as 8-bit PNGs hold them.
-fn measurable(image: RenderedFrame) -> RenderedView {
+pub(super) fn measurable(image: RenderedFrame) -> RenderedView {
     RenderedView {
         rgb: quantised(&image.rgb).as_chunks::<3>().0.to_vec(),
         depth: Some(image.depth),

@@ -10,7 +10,9 @@ pub mod folder;
 pub mod log;
 mod map;
 pub mod metrics;
+mod phrases;
 mod semantics;
+pub mod tables;
 mod train;
 
 use std::path::PathBuf;

@@ -6,16 +6,16 @@ use std::time::Instant;
 
 use divff_exporters::ExrChannel;
 
+use super::phrases::PhraseEvaluation;
 use super::{Event, Observer, PipelineError, RunFolder, Stage};
 use crate::config::Config;
-use crate::eval::{Metrics, PhraseTruth, ScoreSums};
+use crate::eval::{Metrics, PhraseTruth, Task};
 use crate::render::forward::Model;
 use crate::render::sampler::Sampling;
 use crate::scene::features::Space;
 use crate::scene::{Frame, Scene, Split};
 use crate::semantics::agreement::{Compression, compression, feature_cosines};
 use crate::semantics::head::train;
-use crate::semantics::layers::FeatureLayers;
 use crate::semantics::{SemanticFields, SemanticsError, TextSources};
 use crate::train::Trained;
 
@@ -70,11 +70,7 @@ pub(super) struct SemanticEvaluation<'a> {
     scene: &'a Scene,
     config: &'a Config,
     fields: Option<&'a SemanticFields>,
-    truth: PhraseTruth,
-    layers: FeatureLayers<'a>,
-    sums: ScoreSums,
-    /// Why a space has no score.
-    why: [Option<String>; 2],
+    phrases: PhraseEvaluation<'a>,
 }
 
 impl<'a> SemanticEvaluation<'a> {
@@ -85,30 +81,11 @@ impl<'a> SemanticEvaluation<'a> {
         config: &'a Config,
     ) -> Result<Self, PipelineError> {
         let truth = PhraseTruth::read(scene)?;
-        let mut layers = FeatureLayers::new(&config.semantics);
-        let mut why = [None, None];
-        let fields = fields.filter(|f| !f.is_empty());
-        let text = if fields.is_some() { TextSources::of_scene(scene)? } else { TextSources::encoders()? };
-        for space in Space::ALL {
-            let asked = truth.phrases(space);
-            let known = |p: &String| text.embedding(space, p).is_ok();
-            let phrases: Vec<String> = asked.iter().filter(|p| known(p)).cloned().collect();
-            let reason = match fields.map(|f| f.space(space)) {
-                _ if asked.is_empty() => Some("the scene has no truth for it".to_owned()),
-                None => Some("the run has no features".to_owned()),
-                Some(Err(error)) => Some(error.to_string()),
-                Some(Ok(_)) if phrases.is_empty() || text.canonical(space).is_empty() => Some(format!(
-                    "the scene has no embeddings of its phrases, or none of {:?}",
-                    space.canonical_phrases()
-                )),
-                Some(Ok(_)) => None,
-            };
-            if let (None, Some(fields)) = (&reason, fields) {
-                layers.add(fields, space, false, &phrases, &text, config.semantics.temperature)?;
-            }
-            why[space as usize] = reason;
-        }
-        Ok(Self { scene, config, fields, truth, layers, sums: ScoreSums::default(), why })
+        let with = fields.filter(|f| !f.is_empty());
+        let text = if with.is_some() { TextSources::of_scene(scene)? } else { TextSources::encoders()? };
+        let asked = Task::ALL.map(|task| (task, task.space()));
+        let phrases = PhraseEvaluation::new(truth, with, config, &asked, &text)?;
+        Ok(Self { scene, config, fields, phrases })
     }
 
     /// Scores a frame; the layers that show it.
@@ -118,12 +95,8 @@ impl<'a> SemanticEvaluation<'a> {
         frame: &Frame,
         sampling: &Sampling,
     ) -> Result<Vec<ExrChannel>, Box<dyn std::error::Error + Send + Sync>> {
-        if self.layers.is_empty() {
-            return Ok(Vec::new());
-        }
-        let found = self.layers.render(model, frame, sampling)?;
-        self.sums.add(&self.truth, frame, &found.scores)?;
-        Ok(found.channels())
+        let found = self.phrases.add(model, frame, sampling)?;
+        Ok(found.map_or_else(Vec::new, |found| found.channels()))
     }
 
     /// Puts the measures in their place; what compression loses.
@@ -133,7 +106,9 @@ impl<'a> SemanticEvaluation<'a> {
         model: &Model,
         sampling: &Sampling,
     ) -> Result<BTreeMap<String, Compression>, PipelineError> {
-        self.sums.fill_in(metrics, self.why);
+        for asked in self.phrases.finish() {
+            asked.sums.fill_in(metrics, asked.why);
+        }
         let Some(fields) = self.fields else { return Ok(BTreeMap::new()) };
         let cosines = feature_cosines(self.scene, model, fields, &self.config.semantics, sampling)?;
         for (space, found) in Space::ALL.into_iter().zip(cosines) {

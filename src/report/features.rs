@@ -4,9 +4,8 @@ use divff_exporters::{ExrImage, Geometry, read_exr};
 
 use super::html::Figure;
 use super::{ReportError, channel, embed};
-use crate::eval::PhraseTruth;
+use crate::eval::{PhraseTruth, Task};
 use crate::pipeline::RunFolder;
-use crate::scene::features::Space;
 use crate::scene::{Frame, Scene, Split};
 use crate::semantics::overlay::{FROM, overlay};
 use crate::semantics::slug;
@@ -25,21 +24,21 @@ pub fn queries(run: &RunFolder, scene: &Scene) -> Result<Vec<Vec<Figure>>, Repor
     let path = |f: &Frame| run.views().join(format!("{}.exr", f.stem));
     let there = |f: &&Frame| f.split == Split::Test && path(f).is_file();
     let frames: Vec<&Frame> = scene.frames.iter().filter(there).collect();
-    let mut phrases: Vec<(Space, String)> = Vec::new();
-    for space in Space::ALL {
-        phrases.extend(truth.phrases(space).into_iter().map(|p| (space, p)));
+    let mut phrases: Vec<(Task, String)> = Vec::new();
+    for task in Task::ALL {
+        phrases.extend(truth.phrases(task).into_iter().map(|p| (task, p)));
     }
     if phrases.is_empty() || frames.is_empty() {
         return Ok(Vec::new());
     }
     let views: Vec<ExrImage> = frames.iter().map(|f| read_exr(&path(f))).collect::<Result<_, _>>()?;
     let mut rows = Vec::new();
-    for (space, phrase) in phrases {
+    for (task, phrase) in phrases {
         let name = format!("relevancy_{}.Y", slug(&phrase));
         let mut best: Option<(usize, Shown)> = None;
         for (frame, view) in frames.iter().zip(&views) {
             let Some(scores) = channel(view, &name) else { continue };
-            let mask = truth.mask(frame, space, &phrase).map_err(Box::new)?;
+            let mask = truth.mask(frame, task, &phrase).map_err(Box::new)?;
             let size = match &mask {
                 Some(mask) => mask.iter().filter(|m| **m).count(),
                 None => scores.iter().filter(|s| **s > FROM).count(),

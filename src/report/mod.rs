@@ -8,6 +8,7 @@ mod embed;
 mod features;
 mod html;
 pub mod raster;
+pub mod tables;
 
 use std::path::{Path, PathBuf};
 

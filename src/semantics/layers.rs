@@ -110,6 +110,11 @@ impl<'a> FeatureLayers<'a> {
 }
 
 impl FrameFeatures {
+    /// The scores of a phrase in a space, per pixel; `None` if it was not asked.
+    pub fn scores_of(&self, space: Space, phrase: &str) -> Option<&[f32]> {
+        self.scores.iter().find(|s| s.0 == space && s.1 == phrase).map(|s| s.2.as_slice())
+    }
+
     /// As channels: `coverage.Y`, `relevancy_<slug>.Y`, and features in quads `<space>_pca_000.R .G .B .A`.
     pub fn channels(&self) -> Vec<ExrChannel> {
         let half = |name: String, values: &mut dyn Iterator<Item = f32>| ExrChannel {
