@@ -11,17 +11,17 @@ use crate::scene::features::Space;
 use crate::scene::{Frame, Scene};
 
 /// A pixel belongs to a phrase where its score is above this, whatever the phrase.
-const THRESHOLD: f32 = 0.5;
+pub(super) const THRESHOLD: f32 = 0.5;
 
 /// An object or a region is scored in a frame where the truth covers at least so many pixels.
-const MIN_PIXELS: usize = 50;
+pub(super) const MIN_PIXELS: usize = 50;
 
 /// What phrases should find.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PhraseTruth {
-    root: PathBuf,
+    pub(super) root: PathBuf,
     /// Number in `gt/instances` and phrase of every object of the dynamic stream that moves.
-    objects: Vec<(u32, String)>,
+    pub(super) objects: Vec<(u32, String)>,
     /// Phrase and folder under `gt/affordances`.
     affordances: Vec<(String, String)>,
 }
@@ -81,11 +81,11 @@ impl PhraseTruth {
 const OBJECTS: &str = "an object of {name, query, stream, moves} by instance number";
 const AFFORDANCES: &str = "a list of phrases or of {phrase, slug}";
 
-fn wrong(path: &Path, expected: &'static str) -> EvalError {
+pub(super) fn wrong(path: &Path, expected: &'static str) -> EvalError {
     EvalError::Labels { path: path.to_owned(), expected }
 }
 
-fn json(path: &Path) -> Result<Option<(PathBuf, Value)>, EvalError> {
+pub(super) fn json(path: &Path) -> Result<Option<(PathBuf, Value)>, EvalError> {
     if !path.exists() {
         return Ok(None);
     }
@@ -189,7 +189,7 @@ impl ScoreSums {
 }
 
 /// Labels of a frame, 8 or 16 bits; `None` without such a file.
-fn labels(path: &Path, frame: &Frame) -> Result<Option<Vec<u32>>, EvalError> {
+pub(super) fn labels(path: &Path, frame: &Frame) -> Result<Option<Vec<u32>>, EvalError> {
     if !path.exists() {
         return Ok(None);
     }

@@ -7,7 +7,7 @@ use divff_exporters::ExrChannel;
 
 use super::{Event, Observer, PipelineError, RunFolder, Stage};
 use crate::config::Config;
-use crate::eval::{Metrics, PhraseTruth, ScoreSums};
+use crate::eval::{Metrics, MovedObjects, PhraseTruth, ScoreSums};
 use crate::render::forward::Model;
 use crate::render::sampler::Sampling;
 use crate::scene::features::Space;
@@ -68,6 +68,7 @@ pub(super) struct SemanticEvaluation<'a> {
     truth: PhraseTruth,
     layers: FeatureLayers<'a>,
     sums: ScoreSums,
+    moved: MovedObjects,
     /// Why a space has no score.
     why: [Option<String>; 2],
 }
@@ -103,7 +104,9 @@ impl<'a> SemanticEvaluation<'a> {
             }
             why[space as usize] = reason;
         }
-        Ok(Self { scene, config, fields, truth, layers, sums: ScoreSums::default(), why })
+        let moved =
+            if layers.is_empty() { MovedObjects::default() } else { MovedObjects::read(scene, &truth)? };
+        Ok(Self { scene, config, fields, truth, layers, sums: ScoreSums::default(), moved, why })
     }
 
     /// Scores a frame; the layers that show it.
@@ -118,6 +121,7 @@ impl<'a> SemanticEvaluation<'a> {
         }
         let found = self.layers.render(model, frame, sampling)?;
         self.sums.add(&self.truth, frame, &found.scores)?;
+        self.moved.add(self.scene, &self.truth, frame, &found.scores)?;
         Ok(found.channels())
     }
 
@@ -128,6 +132,7 @@ impl<'a> SemanticEvaluation<'a> {
         model: &Model,
         sampling: &Sampling,
     ) -> Result<(), PipelineError> {
+        self.moved.fill_in(metrics);
         self.sums.fill_in(metrics, self.why);
         let Some(fields) = self.fields else { return Ok(()) };
         let cosines = feature_cosines(self.scene, model, fields, &self.config.semantics, sampling)?;
