@@ -33,7 +33,8 @@ fn refused(name: &str, parts: &[&str], break_it: impl FnOnce(&Path)) {
         assert_same_files(&out.join(part), &run().join(part));
     }
     let answer = out.with_file_name("answer");
-    divff(&["query", arg(&out), "--text", "mug", "--out", arg(&answer)]).ok();
+    let intact = ["--scene", arg(scene()), "--out", arg(&answer)];
+    divff(&[&["query", arg(&out), "--text", "mug"], &intact[..]].concat()).ok();
 }
 
 /// Changes the numbers of an array, whose shape stays.
