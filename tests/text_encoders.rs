@@ -68,7 +68,6 @@ fn compare(name: &str) -> (f64, f64) {
 }
 
 #[test]
-#[ignore = "needs PyTorch's models: run tests/text.sh"]
 fn clip_embeds_as_in_pytorch_within_100_ms() {
     let (worst, median) = compare("clip");
     assert!(worst > 0.9999, "{worst}");
@@ -77,14 +76,12 @@ fn clip_embeds_as_in_pytorch_within_100_ms() {
 }
 
 #[test]
-#[ignore = "needs PyTorch's models: run tests/text.sh"]
 fn egovideo_embeds_as_in_pytorch() {
     let (worst, _) = compare("egovideo");
     assert!(worst > 0.9999, "{worst}");
 }
 
 #[test]
-#[ignore = "needs PyTorch's models: run tests/text.sh"]
 fn phrases_that_mean_the_same_to_the_tokenizer_have_the_same_embedding() {
     let encoder = TextEncoder::open(&models("clip")).unwrap();
     let embed = |phrase| encoder.embed(phrase).unwrap();
@@ -93,7 +90,6 @@ fn phrases_that_mean_the_same_to_the_tokenizer_have_the_same_embedding() {
 }
 
 #[test]
-#[ignore = "needs PyTorch's models: run tests/text.sh"]
 fn truncated_models_are_errors_that_name_the_file() {
     let (from, folder) = (models("clip"), tempfile::tempdir().unwrap());
     for name in ["encoder.json", "tokenizer.json"] {

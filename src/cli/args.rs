@@ -284,7 +284,8 @@ pub struct QueryArgs {
     /// Folder for the scored map and the pictures
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Scene (or any folder with text/) whose embeddings are used [default: that of the run]
+    /// Scene (or any folder with text/) whose embeddings are used [default: that of the run; for a file that of the
+    /// run that it lies in, else the file's own folder]
     #[arg(long, value_name = "SCENE")]
     pub scene: Option<PathBuf>,
 }

@@ -44,6 +44,10 @@ pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
     config.seed = args.seed;
     // The short budget is too short to find out that something moves; here it is known.
     config.train.streams = StreamChoice::All;
+    // Its surrogate features are simple: a fifth of the work tells the things apart.
+    config.semantics.steps = 400;
+    config.semantics.rays = 2048;
+    config.semantics.cached_rays = 200_000;
     config.time_budget_s = Some(args.time_budget.as_secs_f64());
     let outcome = pipeline::run(&scene, &config, &run_path, &RunOptions::default(), &mut reporter)?;
     drop(reporter);
@@ -89,5 +93,6 @@ fn opening(run: &RunFolder) -> String {
     for (path, how) in rows.iter().filter(|(path, _)| path.exists()) {
         text.push_str(&format!("\n  {}\n      {how}", path.display()));
     }
+    text.push_str(&format!("\nask it: divff query {} --text mug --out mug", run.root().display()));
     text
 }

@@ -22,6 +22,12 @@ use stop::StopFlag;
 /// Parses the command line and does what it says.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
+    // What was odd but could be worked with goes to standard error; RUST_LOG=off silences it.
+    let filter = tracing_subscriber::EnvFilter::builder()
+        .with_default_directive(tracing_subscriber::filter::LevelFilter::WARN.into())
+        .from_env_lossy();
+    let warnings = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    warnings.without_time().with_target(false).with_ansi(false).init();
     match dispatch(cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

@@ -7,12 +7,13 @@ use divff::pipeline::RunFolder;
 use divff::pipeline::folder::create_writable;
 use divff::report::overview;
 use divff::scene::Scene;
-use divff::scene::features::Space;
+use divff::scene::features::{Space, TextTable};
 use divff::semantics::compress::Compressor;
 use divff::semantics::config::SemanticsConfig;
 use divff::semantics::layers::FeatureLayers;
 use divff::semantics::overlay::overlay;
 use divff::semantics::relevancy::{Points, Queries};
+use divff::semantics::text::TextError;
 use divff::semantics::{SemanticFields, SemanticsError, TextSources, slug};
 use divff_exporters::npz::read_npz_matrices;
 use divff_exporters::{
@@ -114,8 +115,9 @@ pub fn query(args: &QueryArgs) -> Result<(), CliError> {
     }
     let Asked { mut geometries, glb, folder } = asked(&args.path)?;
     let space = Space::from(args.text.space);
-    let mut text = match embeddings_folder(args)? {
-        Some(root) => TextSources::of_folder(&root)?,
+    let scene = embeddings_folder(args)?;
+    let mut text = match &scene {
+        Some(root) => TextSources::of_folder(root)?,
         None => TextSources::encoders()?,
     };
     if let Some(path) = &args.text.text_embedding {
@@ -127,7 +129,9 @@ pub fn query(args: &QueryArgs) -> Result<(), CliError> {
     let name = format!("{}_pca", space.name());
     let compressor = compressor(&folder, &name)?;
     let temperature = args.text.temperature.unwrap_or(SemanticsConfig::default().temperature);
-    let queries = text.queries(space, &compressor, &args.text.text, temperature)?;
+    let queries = text
+        .queries(space, &compressor, &args.text.text, temperature)
+        .map_err(|e| explained(e, args, scene.as_deref()))?;
     create_writable(&args.out)?;
     for geometry in &mut geometries {
         score(geometry, &name, &queries, &args.text.text, &args.path)?;
@@ -153,7 +157,13 @@ fn asked(path: &Path) -> Result<Asked, CliError> {
     let folder = path.parent().unwrap_or(Path::new("")).to_owned();
     match extension.as_str() {
         "ply" if path.is_file() => Ok(Asked { geometries: vec![read_ply(path)?], glb: false, folder }),
-        "glb" if path.is_file() => Ok(Asked { geometries: read_glb(path)?.geometries, glb: true, folder }),
+        "glb" if path.is_file() => {
+            let mut geometries = read_glb(path)?.geometries;
+            for geometry in &mut geometries {
+                take_features(geometry, &folder)?;
+            }
+            Ok(Asked { geometries, glb: true, folder })
+        }
         _ if path.is_dir() => {
             let folder = RunFolder::open(path)?.map();
             let manifest = Manifest::read(&folder).map_err(|_| {
@@ -174,12 +184,59 @@ fn asked(path: &Path) -> Result<Asked, CliError> {
     }
 }
 
-/// Where embeddings come from: what is named, or the scene of the run.
+/// An export's GLB files hold scores but no features; those are in the PLY file of the same mesh beside it.
+fn take_features(geometry: &mut Geometry, folder: &Path) -> Result<(), CliError> {
+    let path = folder.join(format!("{}.ply", geometry.name));
+    if geometry.features.is_empty() && path.is_file() {
+        let same = read_ply(&path)?;
+        if same.positions.len() == geometry.positions.len() {
+            geometry.features = same.features;
+        }
+    }
+    Ok(())
+}
+
+/// Where embeddings come from: what is named, the scene of the run, or for a map's file the scene of the run that it
+/// lies in, else the map's own folder.
 fn embeddings_folder(args: &QueryArgs) -> Result<Option<PathBuf>, CliError> {
-    match (&args.scene, args.path.is_dir()) {
-        (Some(scene), _) => Ok(Some(scene.clone())),
-        (None, true) => Ok(Some(RunFolder::open(&args.path)?.scene(None)?.root)),
-        (None, false) => Ok(None),
+    if let Some(scene) = &args.scene {
+        return Ok(Some(scene.clone()));
+    }
+    if args.path.is_dir() {
+        return Ok(Some(RunFolder::open(&args.path)?.scene(None)?.root));
+    }
+    // A bare `persistent.ply` lies in the working folder, whose parent only its full path tells.
+    let file = std::path::absolute(&args.path).unwrap_or_else(|_| args.path.clone());
+    let map = file.parent().unwrap_or(Path::new("/"));
+    let of_run = map.ancestors().take(2).find_map(scene_of_run);
+    Ok(of_run.or_else(|| has_embeddings(map).then(|| map.to_owned())))
+}
+
+/// The scene of a run if it is still there and has embeddings. Only these are read of it, so it need not be the
+/// same to the last frame.
+fn scene_of_run(folder: &Path) -> Option<PathBuf> {
+    let named = RunFolder::open(folder).ok()?.record().ok()?.scene;
+    let scene = if named.is_file() { named.parent()?.to_owned() } else { named };
+    has_embeddings(&scene).then_some(scene)
+}
+
+fn has_embeddings(folder: &Path) -> bool {
+    Space::ALL.into_iter().any(|space| TextTable::paths(folder, space).iter().any(|p| p.is_file()))
+}
+
+/// That a bare map comes without embeddings, where nothing is known that could give any.
+fn explained(error: SemanticsError, args: &QueryArgs, folder: Option<&Path>) -> CliError {
+    let nowhere = folder.is_none() && args.text.text_embedding.is_none() && args.text.text_encoder.is_none();
+    match &error {
+        SemanticsError::Text(text) if nowhere && matches!(**text, TextError::Phrase { .. }) => {
+            CliError::Input {
+                path: args.path.clone(),
+                what: format!("no embeddings come with this map ({error})"),
+                remedy: "name the scene that it was made from with --scene, or put the scene's folder text/ beside \
+                     the map",
+            }
+        }
+        _ => error.into(),
     }
 }
 
@@ -214,7 +271,7 @@ fn score(
         return Err(CliError::Input {
             path: path.to_owned(),
             what: format!("`{}` has no features `{name}`", geometry.name),
-            remedy: "export the map of a run that was trained with such features",
+            remedy: "export the map of a run that was trained with such features, and keep the .ply files beside a .glb",
         });
     };
     let found = queries.score(Points::F32(&features.values)).map_err(SemanticsError::from)?;

@@ -9,6 +9,7 @@ pub mod detections;
 mod error;
 mod evaluate;
 mod images;
+mod moved;
 mod scores;
 mod ssim;
 pub mod surface;
@@ -20,6 +21,7 @@ pub use detections::{DetectionError, Detections};
 pub use error::EvalError;
 pub use evaluate::{evaluate, evaluate_geometry, evaluate_images};
 pub use images::{ImageSums, RenderedView};
+pub use moved::MovedObjects;
 pub(crate) use scores::NOTHING;
 pub use scores::{PhraseTruth, ScoreSums, THRESHOLD, Task};
 use serde::{Deserialize, Serialize};
@@ -63,6 +65,13 @@ pub struct Metrics {
     /// Likewise of the affordances' regions (video-language).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub affordance_miou: Option<f64>,
+    /// Share of the views of objects that move (one object in one test frame) in which its phrase finds it where it is
+    /// at that time and at none of the places where it is at other times, as far as the frame shows them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub moved_objects_found: Option<f64>,
+    /// How many such views there are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub moved_objects_scored: Option<usize>,
     /// Mean cosine between rendered image-language descriptors and the scene's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub feature_cosine_clip: Option<f64>,

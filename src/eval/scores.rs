@@ -16,7 +16,7 @@ use crate::scene::{Frame, Scene};
 pub const THRESHOLD: f32 = 0.5;
 
 /// An object or a region is scored in a frame where the truth covers at least so many pixels.
-const MIN_PIXELS: usize = 50;
+pub(super) const MIN_PIXELS: usize = 50;
 
 /// What phrases are to find; each task has a truth and a measure of its own, whichever features are asked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -46,9 +46,9 @@ impl Task {
 /// What phrases should find.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PhraseTruth {
-    root: PathBuf,
+    pub(super) root: PathBuf,
     /// Number in `gt/instances` and phrase of every object of the dynamic stream that moves.
-    objects: Vec<(u32, String)>,
+    pub(super) objects: Vec<(u32, String)>,
     /// Phrase and folder under `gt/affordances`.
     affordances: Vec<(String, String)>,
 }
@@ -108,11 +108,11 @@ impl PhraseTruth {
 const OBJECTS: &str = "an object of {name, query, stream, moves} by instance number";
 const AFFORDANCES: &str = "a list of phrases or of {phrase, slug}";
 
-fn wrong(path: &Path, expected: &'static str) -> EvalError {
+pub(super) fn wrong(path: &Path, expected: &'static str) -> EvalError {
     EvalError::Labels { path: path.to_owned(), expected }
 }
 
-fn json(path: &Path) -> Result<Option<(PathBuf, Value)>, EvalError> {
+pub(super) fn json(path: &Path) -> Result<Option<(PathBuf, Value)>, EvalError> {
     if !path.exists() {
         return Ok(None);
     }
@@ -238,7 +238,7 @@ impl ScoreSums {
 pub(crate) const NOTHING: &str = "no true mask of a phrase covers 50 px in a test frame";
 
 /// Labels of a frame, 8 or 16 bits; `None` without such a file.
-fn labels(path: &Path, frame: &Frame) -> Result<Option<Vec<u32>>, EvalError> {
+pub(super) fn labels(path: &Path, frame: &Frame) -> Result<Option<Vec<u32>>, EvalError> {
     if !path.exists() {
         return Ok(None);
     }

@@ -68,6 +68,11 @@ impl<'a> PhraseEvaluation<'a> {
         Ok(Self { truth, layers, asked: tasks })
     }
 
+    /// Whether nothing can be asked.
+    pub(super) fn is_empty(&self) -> bool {
+        self.layers.is_empty()
+    }
+
     /// Renders and scores a frame; `None` where nothing can be asked.
     pub(super) fn add(
         &mut self,
@@ -75,7 +80,7 @@ impl<'a> PhraseEvaluation<'a> {
         frame: &Frame,
         sampling: &Sampling,
     ) -> Result<Option<FrameFeatures>, PipelineError> {
-        if self.layers.is_empty() {
+        if self.is_empty() {
             return Ok(None);
         }
         let found = self.layers.render(model, frame, sampling)?;

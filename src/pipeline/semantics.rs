@@ -9,7 +9,7 @@ use divff_exporters::ExrChannel;
 use super::phrases::PhraseEvaluation;
 use super::{Event, Observer, PipelineError, RunFolder, Stage};
 use crate::config::Config;
-use crate::eval::{Metrics, PhraseTruth, Task};
+use crate::eval::{Metrics, MovedObjects, PhraseTruth, Task};
 use crate::render::forward::Model;
 use crate::render::sampler::Sampling;
 use crate::scene::features::Space;
@@ -70,7 +70,9 @@ pub(super) struct SemanticEvaluation<'a> {
     scene: &'a Scene,
     config: &'a Config,
     fields: Option<&'a SemanticFields>,
+    truth: PhraseTruth,
     phrases: PhraseEvaluation<'a>,
+    moved: MovedObjects,
 }
 
 impl<'a> SemanticEvaluation<'a> {
@@ -84,8 +86,12 @@ impl<'a> SemanticEvaluation<'a> {
         let with = fields.filter(|f| !f.is_empty());
         let text = if with.is_some() { TextSources::of_scene(scene)? } else { TextSources::encoders()? };
         let asked = Task::ALL.map(|task| (task, task.space()));
-        let phrases = PhraseEvaluation::new(truth, with, config, &asked, &text)?;
-        Ok(Self { scene, config, fields, phrases })
+        let phrases = PhraseEvaluation::new(truth.clone(), with, config, &asked, &text)?;
+        let moved = match phrases.is_empty() {
+            true => MovedObjects::default(),
+            false => MovedObjects::read(scene, &truth)?,
+        };
+        Ok(Self { scene, config, fields, truth, phrases, moved })
     }
 
     /// Scores a frame; the layers that show it.
@@ -95,8 +101,9 @@ impl<'a> SemanticEvaluation<'a> {
         frame: &Frame,
         sampling: &Sampling,
     ) -> Result<Vec<ExrChannel>, Box<dyn std::error::Error + Send + Sync>> {
-        let found = self.phrases.add(model, frame, sampling)?;
-        Ok(found.map_or_else(Vec::new, |found| found.channels()))
+        let Some(found) = self.phrases.add(model, frame, sampling)? else { return Ok(Vec::new()) };
+        self.moved.add(self.scene, &self.truth, frame, &found.scores)?;
+        Ok(found.channels())
     }
 
     /// Puts the measures in their place; what compression loses.
@@ -106,6 +113,7 @@ impl<'a> SemanticEvaluation<'a> {
         model: &Model,
         sampling: &Sampling,
     ) -> Result<BTreeMap<String, Compression>, PipelineError> {
+        self.moved.fill_in(metrics);
         for asked in self.phrases.finish() {
             asked.sums.fill_in(metrics, asked.why);
         }

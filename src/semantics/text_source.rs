@@ -113,10 +113,24 @@ impl TextSources {
     ) -> Result<Queries, SemanticsError> {
         let wanted: Vec<Vec<f32>> =
             phrases.iter().map(|p| self.embedding(space, p)).collect::<Result<_, _>>()?;
+        let missing = self.missing_canonical(space);
         let canonical = self.canonical(space);
+        if !missing.is_empty() && !canonical.is_empty() {
+            tracing::warn!(
+                "no {} embedding of the canonical {missing:?}: scores are held against the other canonical phrases, and \
+                 are higher than they should be; add the missing ones to the scene's text/{0}.txt and .npy",
+                space.name()
+            );
+        }
         let wanted: Vec<&[f32]> = wanted.iter().map(Vec::as_slice).collect();
         let canonical: Vec<&[f32]> = canonical.iter().map(Vec::as_slice).collect();
         Ok(queries(&wanted, &canonical)?)
+    }
+
+    /// Canonical phrases that no source knows.
+    fn missing_canonical(&self, space: Space) -> Vec<&'static str> {
+        let phrases = space.canonical_phrases().iter().copied();
+        phrases.filter(|p| self.embedding(space, p).is_err()).collect()
     }
 
     /// Embeddings of the canonical phrases that are known.

@@ -4,10 +4,11 @@
 //! A head walks between work places and looks around; a hand picks up mugs and pans and puts them down
 //! elsewhere. Poses, depth, instances, streams and meshes are exact: the meshes are what the images show.
 //!
-//! `room`, `furniture` and `props` say what there is, `story` what happens, `render` what is seen of it,
-//! `write` stores it.
+//! `room`, `furniture` and `props` say what there is, `story` what happens, `render` what is seen of it, `features` what
+//! models might say about it, `write` stores it.
 
 mod arms;
+mod features;
 mod furniture;
 mod material;
 mod mesh;
@@ -20,12 +21,13 @@ mod write;
 
 use std::path::{Path, PathBuf};
 
+use features::Models;
 use glam::Affine3A;
 use mesh::Mesh;
 use props::Prop;
 use rayon::prelude::*;
 use render::{Body, Lens, Picture, Stage};
-use room::Room;
+use room::{Room, Thing};
 use story::Story;
 
 use crate::error::FileError;
@@ -85,8 +87,12 @@ impl SynthOptions {
         Lens { width: self.width, height: self.height, focal: f64::from(self.width) / 2.0 / half.tan() }
     }
 
+    fn is_test(&self, frame: u32) -> bool {
+        frame % TEST_PERIOD == TEST_PHASE
+    }
+
     fn test_frames(&self) -> Vec<u32> {
-        (0..self.frames).filter(|f| f % TEST_PERIOD == TEST_PHASE).collect()
+        (0..self.frames).filter(|f| self.is_test(*f)).collect()
     }
 
     /// Test frames, evenly spread, that get a mesh of what moves.
@@ -166,6 +172,12 @@ impl Kitchen {
         Self { room, still, props, story }
     }
 
+    /// Everything with an instance number, which is its place in the list plus one.
+    fn things(&self) -> Vec<Thing> {
+        let props = self.props.iter().map(|p| p.thing.clone());
+        self.room.things.iter().cloned().chain(props).chain(arms::things()).collect()
+    }
+
     /// Instance number of a prop.
     fn prop_instance(&self, prop: usize) -> u16 {
         (self.room.things.len() + prop + 1) as u16
@@ -224,16 +236,22 @@ pub fn generate(options: &SynthOptions, out: &Path) -> Result<SynthSummary, Synt
     write::prepare(out)?;
     let kitchen = Kitchen::new(options);
     let lens = options.lens();
+    let (models, things) = (Models::new(&kitchen, options.seed), kitchen.things());
     (0..options.frames).into_par_iter().try_for_each(|frame| {
         let picture = kitchen.picture(&lens, options.time(frame));
-        write::frame(out, &kitchen, options, frame, &picture)
+        write::frame(out, &kitchen, options, frame, &picture)?;
+        if options.is_test(frame) {
+            features::affordance_masks(out, &things, options, frame, &picture)?;
+        }
+        models.frame(out, &kitchen, options, frame, &picture)
     })?;
+    models.descriptions(out, options)?;
     write::meshes(out, &kitchen, options)?;
     write::descriptions(out, &kitchen, options)?;
     write::transforms(out, &kitchen, options)?;
     Ok(SynthSummary {
         frames: options.frames,
-        instances: kitchen.prop_instance(kitchen.props.len()) as usize + arms::things().len() - 1,
+        instances: things.len(),
         moves: kitchen.story.moves.len(),
         persistent_triangles: kitchen.still.mesh.triangles.len(),
         mesh_frames: options.mesh_frames(),

@@ -13,7 +13,7 @@ use serde_json::{Map, Value, json};
 
 use super::mesh::Mesh;
 use super::render::Picture;
-use super::{Kitchen, SynthError, SynthOptions, arms};
+use super::{Kitchen, SynthError, SynthOptions, features};
 use crate::error::FileError;
 
 /// Millimetres per metre: depth is stored as 16-bit millimetres.
@@ -27,7 +27,9 @@ pub(super) fn prepare(out: &Path) -> Result<(), SynthError> {
     if out.exists() && fs::read_dir(out).map_err(FileError::at(out))?.next().is_some() {
         return Err(SynthError::NotEmpty { path: out.to_path_buf() });
     }
-    for folder in ["images", "depth", "gt/streams", "gt/instances", "gt/mesh"] {
+    let folders =
+        ["images", "depth", "gt/streams", "gt/instances", "gt/mesh"].into_iter().chain(features::FOLDERS);
+    for folder in folders.map(str::to_owned).chain(features::affordance_folders()) {
         let folder = out.join(folder);
         fs::create_dir_all(&folder).map_err(FileError::at(&folder))?;
     }
@@ -55,7 +57,12 @@ pub(super) fn frame(
 }
 
 /// `pixels` in native byte order, as the encoder wants them.
-fn png(path: &Path, pixels: &[u8], size: (u32, u32), color: ExtendedColorType) -> Result<(), SynthError> {
+pub(super) fn png(
+    path: &Path,
+    pixels: &[u8],
+    size: (u32, u32),
+    color: ExtendedColorType,
+) -> Result<(), SynthError> {
     let mut file = Cursor::new(Vec::new());
     PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Adaptive)
         .write_image(pixels, size.0, size.1, color)
@@ -86,11 +93,12 @@ fn mesh(out: &Path, name: String, mesh: &Mesh) -> Result<(), SynthError> {
     Ok(write_ply(&path, &geometry, &PlyOptions::default())?)
 }
 
-/// `gt/objects.json` and `gt/timeline.json`.
+/// `gt/objects.json`, `gt/affordances.json` and `gt/timeline.json`.
 pub(super) fn descriptions(out: &Path, kitchen: &Kitchen, options: &SynthOptions) -> Result<(), SynthError> {
-    let props = kitchen.props.iter().map(|p| p.thing.clone());
-    let things = kitchen.room.things.iter().cloned().chain(props).chain(arms::things());
+    let things = kitchen.things();
+    write_json(&out.join("gt/affordances.json"), &features::affordances(&things))?;
     let objects: Map<String, Value> = things
+        .iter()
         .enumerate()
         .map(|(i, t)| {
             let stream = STREAMS[usize::from(t.stream)];
@@ -173,6 +181,6 @@ fn rows(pose: &Affine3A) -> [f64; 16] {
     Mat4::from(*pose).transpose().to_cols_array().map(f64::from)
 }
 
-fn write_json(path: &Path, value: &Value) -> Result<(), SynthError> {
+pub(super) fn write_json(path: &Path, value: &Value) -> Result<(), SynthError> {
     Ok(write_bytes_atomically(path, format!("{value:#}\n").as_bytes())?)
 }

@@ -24,6 +24,16 @@ points = 1000
 depth_rays = 20000
 depth_samples = 16
 times = \"frame:4\"
+[semantics]
+steps = 60
+rays = 512
+cached_rays = 8000
+hidden = 16
+persistent = { levels = 3, coarsest = 4.0, finest = 16.0, log2_rows = 12, time_levels = 0, time_finest = 0.0 }
+dynamic = { levels = 2, coarsest = 4.0, finest = 16.0, log2_rows = 12, time_levels = 1, time_finest = 8.0 }
+actor = { levels = 2, coarsest = 4.0, finest = 8.0, log2_rows = 12, time_levels = 1, time_finest = 8.0 }
+[semantics.compress]
+dim = 16
 ";
 
 /// What a command did.

@@ -1,6 +1,8 @@
 //! The `divff` program from outside: what every command makes, says and returns.
 
+mod broken_features;
 mod broken_input;
 mod commands;
+mod features;
 mod kit;
 mod resuming;

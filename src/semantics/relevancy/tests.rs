@@ -178,34 +178,6 @@ fn what_cannot_be_asked_is_an_error() {
     assert_eq!(queries.score(Points::F32(&[])).unwrap().coverage.len(), 0);
 }
 
-/// Seconds of the quickest of some runs.
-fn quickest(mut run: impl FnMut()) -> f64 {
-    (0..7)
-        .map(|_| {
-            let start = std::time::Instant::now();
-            run();
-            start.elapsed().as_secs_f64()
-        })
-        .fold(f64::INFINITY, f64::min)
-}
-
-/// `cargo test --release --lib relevancy_of_a_million -- --ignored --nocapture`
-#[test]
-#[ignore = "measures; run it alone, in release"]
-fn relevancy_of_a_million_points_in_time() {
-    const POINTS: usize = 1_000_000;
-    for (dim, half, bar_ms) in [(32, false, 15.0), (32, true, 15.0), (512, false, 150.0), (512, true, 150.0)]
-    {
-        let f: Vec<f32> = random(1000 * dim, 1).repeat(POINTS / 1000);
-        let stored: Vec<f16> = if half { f.iter().map(|v| f16::from_f32(*v)).collect() } else { Vec::new() };
-        let (q, c) = (random(dim, 2), random(5 * dim, 3));
-        let queries = Queries::new(Space::Clip, &[&q], &slices(&c, dim), 10.0).unwrap();
-        let points = if half { Points::F16(&stored) } else { Points::F32(&f) };
-        let ms = 1e3 * quickest(|| drop(std::hint::black_box(queries.score(points).unwrap())));
-        eprintln!("1 M × {dim}, {}: {ms:.1} ms (bar {bar_ms} ms)", if half { "f16" } else { "f32" });
-    }
-}
-
 #[test]
 fn each_phrase_has_the_scores_of_its_best_size() {
     let axis = |n: usize| -> Vec<f32> { (0..4).map(|k| f32::from(u8::from(k == n))).collect() };
