@@ -12,6 +12,7 @@ use divff::semantics::targets::{
 use divff::synth::{SynthOptions, generate};
 
 const FRAMES: u32 = 10;
+const FOLDERS: [&str; 4] = ["language_features", "video_features", "hotspots", "dino_features"];
 const KINDS: [&str; 5] = ["segmenter", "image", "video", "hands", "parts"];
 
 fn root() -> PathBuf {
@@ -32,17 +33,21 @@ fn extract(scene: &Path, calls: usize, more: &[&str]) -> Output {
     command.args(more).output().expect("Python starts")
 }
 
+/// A scene whose features are still to be extracted.
 fn synth() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene");
     generate(&SynthOptions { frames: FRAMES, width: 48, height: 32, seed: 1 }, &path).unwrap();
+    for kind in FOLDERS {
+        std::fs::remove_dir_all(path.join(kind)).unwrap();
+    }
     (folder, path)
 }
 
 /// All feature files and their bytes.
 fn files(scene: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
-    for name in ["language_features", "video_features", "hotspots", "dino_features"] {
+    for name in FOLDERS {
         for entry in std::fs::read_dir(scene.join(name)).into_iter().flatten() {
             let path = entry.unwrap().path();
             found.insert(path.strip_prefix(scene).unwrap().to_owned(), std::fs::read(path).unwrap());

@@ -170,7 +170,7 @@ fn inspect_describes_scenes_runs_maps_and_files() {
     let said = |path: &std::path::Path| divff(&["inspect", arg(path), "--deep"]).ok();
     assert!(said(scene()).contains("16 (14 train, 2 test)"));
     let text = said(run());
-    assert!(text.contains("400 steps") && text.contains("finished") && text.contains("PSNR"), "{text}");
+    assert!(text.contains("430 steps") && text.contains("finished") && text.contains("PSNR"), "{text}");
     assert!(said(&map).contains("all files are as they were written"));
     let points = read_ply(&map.join("points.ply")).unwrap().positions.len();
     for name in ["points.ply", "points.npz"] {

@@ -28,6 +28,7 @@ times = \"frame:4\"
 steps = 60
 rays = 512
 cached_rays = 8000
+joint_steps = 10
 hidden = 16
 persistent = { levels = 3, coarsest = 4.0, finest = 16.0, log2_rows = 12, time_levels = 0, time_finest = 0.0 }
 dynamic = { levels = 2, coarsest = 4.0, finest = 16.0, log2_rows = 12, time_levels = 1, time_finest = 8.0 }

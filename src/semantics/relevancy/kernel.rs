@@ -91,6 +91,7 @@ impl WithSimd for Run<'_, '_> {
         let mut wide = Vec::new();
         let mut products = vec![0.0; BLOCK * stride];
         let mut squares = [0.0; BLOCK];
+        let mut judged = Judged::new(packed);
         let mut first_bad = None;
         for start in (0..coverage.len()).step_by(BLOCK) {
             let count = BLOCK.min(coverage.len() - start);
@@ -111,22 +112,27 @@ impl WithSimd for Run<'_, '_> {
             for (square, row) in squares.iter_mut().zip(rows.chunks_exact(dim)) {
                 *square = squared(simd, row);
             }
-            for n in 0..count {
-                let (at, row) = (start + n, &rows[n * dim..][..dim]);
-                let products = &products[n * stride..][..packed.used];
-                coverage[at] = 1.0;
-                // Margins for now; scores are made of them below, in a loop that vectorises.
-                if let Some((nearest, scale)) = judge(queries, products, squares[n]) {
-                    for (scores, product) in scores.iter_mut().zip(products) {
-                        scores[at] = (product - nearest) * scale;
-                    }
-                    continue;
+            judge(queries, packed, &products, &squares, &mut judged);
+            coverage[start..start + count].fill(1.0);
+            // Margins for now; scores are made of them below.
+            for (scores, products) in scores.iter_mut().zip(judged.columns.as_chunks::<BLOCK>().0) {
+                let margins = products.iter().zip(&judged.nearest).zip(&judged.scale);
+                for (score, ((product, nearest), scale)) in
+                    scores[start..start + count].iter_mut().zip(margins)
+                {
+                    *score = (product - nearest) * scale;
                 }
-                match judge_in_f64(queries, row) {
+            }
+            for n in (0..count).filter(|n| !judged.sound[*n]) {
+                let at = start + n;
+                match judge_in_f64(queries, &rows[n * dim..][..dim]) {
                     Rare::Margins(margins) => {
                         scores.iter_mut().zip(margins).for_each(|(scores, margin)| scores[at] = margin);
                     }
-                    Rare::Nothing => coverage[at] = 0.0,
+                    Rare::Nothing => {
+                        coverage[at] = 0.0;
+                        scores.iter_mut().for_each(|scores| scores[at] = 0.0);
+                    }
                     Rare::NonFinite => first_bad = first_bad.or(Some(at)),
                 }
             }
@@ -193,15 +199,45 @@ fn squared<S: Simd>(simd: S, row: &[f32]) -> f32 {
     total
 }
 
-/// What turns a point's products into margins, `(product - nearest) * scale`; `None` where f32 is not enough.
+/// What turns the products of a block into margins, `(product - nearest) * scale`.
+struct Judged {
+    /// `[used, BLOCK]`: the products, phrase by phrase, so that what follows goes over many points at once.
+    columns: Vec<f32>,
+    nearest: [f32; BLOCK],
+    scale: [f32; BLOCK],
+    /// Where f32 is enough.
+    sound: [bool; BLOCK],
+}
+
+impl Judged {
+    fn new(packed: &Packed) -> Self {
+        let columns = vec![0.0; packed.used * BLOCK];
+        Self { columns, nearest: [0.0; BLOCK], scale: [0.0; BLOCK], sound: [false; BLOCK] }
+    }
+}
+
+/// Judges the products `[BLOCK, stride]` and squared lengths of a block.
 #[inline(always)]
-fn judge(queries: &Queries, products: &[f32], square: f32) -> Option<(f32, f32)> {
-    let (canonical, norm2) =
-        (&products[queries.wanted..products.len() - 1], products[products.len() - 1] + square);
-    let nearest = canonical.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    // False for NaN and infinities too, and where squares underflow.
-    let sound = norm2 > CANCELLED * (queries.norm.constant + square) && square > 1e-30 && square < 1e30;
-    sound.then(|| (nearest, queries.temperature / norm2.sqrt()))
+fn judge(queries: &Queries, packed: &Packed, products: &[f32], squares: &[f32; BLOCK], out: &mut Judged) {
+    for (p, products) in products.chunks_exact(packed.stride).enumerate() {
+        for (n, product) in products[..packed.used].iter().enumerate() {
+            out.columns[n * BLOCK + p] = *product;
+        }
+    }
+    let (phrases, linear) = out.columns.as_chunks::<BLOCK>().0.split_at(packed.used - 1);
+    out.nearest = [f32::NEG_INFINITY; BLOCK];
+    for canonical in &phrases[queries.wanted..] {
+        for (nearest, product) in out.nearest.iter_mut().zip(canonical) {
+            *nearest = if *product > *nearest { *product } else { *nearest };
+        }
+    }
+    let constant = queries.norm.constant;
+    for p in 0..BLOCK {
+        let (square, norm2) = (squares[p], linear[0][p] + squares[p]);
+        // False for NaN and infinities too, and where squares underflow.
+        out.sound[p] = norm2 > CANCELLED * (constant + square) && square > 1e-30 && square < 1e30;
+        out.scale[p] = queries.temperature / norm2.sqrt();
+    }
 }
 
 enum Rare {
