@@ -43,10 +43,10 @@ pub fn train(args: &RunArgs, stop: StopFlag) -> Result<(), CliError> {
     let scene = open(&args.scene, &reporter)?;
     let run = RunFolder::new(&args.out);
     reporter.event(&Event::Stage(Stage::Training));
-    let trained = pipeline::train(&scene, &config, &run, args.fresh, &mut reporter)?;
-    let progress = trained.progress.clone();
+    let session = pipeline::train(&scene, &config, &run, args.fresh, &mut reporter)?;
+    let progress = session.trained().progress.clone();
     let finished = progress.finished
-        && pipeline::train_features(&scene, trained, &config, &run, &mut reporter)?.is_some();
+        && pipeline::train_features(&scene, session, &config, &run, &mut reporter)?.is_some();
     drop(reporter);
     if !finished {
         return Err(CliError::Stopped { step: progress.step });

@@ -137,12 +137,13 @@ pub fn run(
     let run = RunFolder::new(out);
     let mut cost = Cost::default();
     observer.event(&Event::Stage(Stage::Training));
-    let trained = train(scene, config, &run, options.fresh, observer)?;
-    let stopped = Outcome::Stopped { step: trained.progress.step };
-    if !trained.progress.finished {
+    let session = train(scene, config, &run, options.fresh, observer)?;
+    let progress = &session.trained().progress;
+    let stopped = Outcome::Stopped { step: progress.step };
+    if !progress.finished {
         return Ok(stopped);
     }
-    let Some((fields, trained)) = train_features(scene, trained, config, &run, observer)? else {
+    let Some((fields, trained)) = train_features(scene, session, config, &run, observer)? else {
         return Ok(stopped);
     };
     cost.feature_seconds = Some(fields.seconds);

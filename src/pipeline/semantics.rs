@@ -17,9 +17,9 @@ use crate::scene::{Frame, Scene, Split};
 use crate::semantics::agreement::{Compression, compression, feature_cosines};
 use crate::semantics::head::train;
 use crate::semantics::{SemanticFields, SemanticsError, TextSources};
-use crate::train::Trained;
+use crate::train::{Session, Trained};
 
-/// Trains the fields of features on the geometry of `trained` and stores them, and the geometry where it was trained
+/// Trains the fields of features on the geometry of `session` and stores them, and the geometry where it was trained
 /// with them; those of an earlier call with the same geometry and settings are taken as they are. `None` if the observer
 /// said stop.
 ///
@@ -27,33 +27,37 @@ use crate::train::Trained;
 /// Features that cannot be used, or a file that cannot be written.
 pub fn train_features(
     scene: &Scene,
-    trained: Trained,
+    mut session: Session,
     config: &Config,
     run: &RunFolder,
     observer: &mut dyn Observer,
 ) -> Result<Option<(SemanticFields, Trained)>, PipelineError> {
     match SemanticFields::load(run.root()) {
-        Ok(Some(fields)) if fields.fits(&trained, &config.semantics) => return Ok(Some((fields, trained))),
+        Ok(Some(fields)) if fields.fits(session.trained(), &config.semantics) => {
+            return Ok(Some((fields, session.into_trained())));
+        }
         // Damaged or of another version: what is derived is made again.
         Ok(_) | Err(SemanticsError::Stored(_)) => {}
         Err(error) => return Err(error.into()),
     }
     observer.event(&Event::Stage(Stage::Features));
     let start = Instant::now();
-    let found = train::train_features(scene, &trained, config, run.root(), &mut |progress| {
+    let before = session.trained().progress.joint;
+    let found = train::train_features(scene, &mut session, config, run.root(), &mut |progress| {
         observer.event(&Event::Features(progress));
         if observer.stop() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     })?;
-    let Some((mut fields, trainer)) = found else { return Ok(None) };
+    let Some(mut fields) = found else { return Ok(None) };
     for warning in &fields.warnings {
         tracing::warn!("{warning}");
     }
     fields.seconds = start.elapsed().as_secs_f64();
     fields.save(run.root())?;
-    let Some(trainer) = trainer else { return Ok(Some((fields, trained))) };
-    // After the features: a run that is stopped between the two has features of no geometry, and makes both again.
-    trainer.save(run.root())?;
-    Ok(Some((fields, trainer.into_trained())))
+    if session.trained().progress.joint > before {
+        // After the features: a run that is stopped between the two has features of no geometry, and makes both again.
+        session.open(scene, config, run.root())?.save(run.root())?;
+    }
+    Ok(Some((fields, session.into_trained())))
 }
 
 /// The fields of features of a run; `None` if none were trained, or on another geometry.

@@ -17,7 +17,7 @@ use crate::scene::features::Space;
 use crate::scene::{Frame, Scene, Split};
 use crate::semantics::TextSources;
 use crate::semantics::targets::ImageMode;
-use crate::train::{StreamChoice, Trained};
+use crate::train::{Session, StreamChoice, Trained};
 
 /// A field of features that the paper compares; in its order from worst to best.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -162,7 +162,7 @@ fn geometry(
     observer: &mut dyn Observer,
 ) -> Result<Option<Geometry>, PipelineError> {
     observer.event(&Event::Stage(Stage::Training));
-    let trained = train(scene, config, run, false, observer)?;
+    let trained = train(scene, config, run, false, observer)?.into_trained();
     if !trained.progress.finished {
         return Ok(None);
     }
@@ -197,7 +197,8 @@ fn rows(
     observer: &mut dyn Observer,
 ) -> Result<Option<Vec<TableRow>>, PipelineError> {
     let trained = &geometry.trained;
-    let found = train_features(scene, trained.clone(), config, run, observer)?;
+    let session = Session::Over(Box::new(trained.clone()));
+    let found = train_features(scene, session, config, run, observer)?;
     let Some((fields, _)) = found else { return Ok(None) };
     let without = |asked: &(Task, Space)| unknown(text, &truth.phrases(asked.0), asked.1);
     let asked: Vec<(Task, Space)> =

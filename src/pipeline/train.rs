@@ -12,7 +12,7 @@ use super::{Event, Observer, PipelineError};
 use crate::config::Config;
 use crate::error::FileError;
 use crate::scene::Scene;
-use crate::train::{Trained, Trainer};
+use crate::train::{Session, Trainer};
 
 /// Trains `run` on `scene` until the schedule ends or `observer` says stop; in both cases what was trained is stored.
 ///
@@ -27,7 +27,7 @@ pub fn train(
     run: &RunFolder,
     fresh: bool,
     observer: &mut dyn Observer,
-) -> Result<Trained, PipelineError> {
+) -> Result<Session, PipelineError> {
     config.validate()?;
     run.create()?;
     if fresh {
@@ -41,7 +41,7 @@ pub fn train(
         if progress.finished {
             run.write_record(scene, config)?;
             observer.event(&Event::AlreadyTrained { step: progress.step });
-            return Ok(trained);
+            return Ok(Session::Over(Box::new(trained)));
         }
         drop(trained);
         observer.event(&Event::Resuming { step: progress.step, seconds: progress.seconds });
@@ -64,7 +64,7 @@ pub fn train(
     })?;
     match failed {
         Some(error) => Err(error),
-        None => Ok(trainer.into_trained()),
+        None => Ok(Session::Open(Box::new(trainer))),
     }
 }
 

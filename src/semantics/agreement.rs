@@ -7,7 +7,7 @@ use super::compress::Compressor;
 use super::config::SemanticsConfig;
 use super::error::SemanticsError;
 use super::fields::{SemanticFields, SpaceField};
-use super::head::{HeadModel, render_features, trace_frame};
+use super::head::{HeadModel, render_features, trace_pixels};
 use super::relevancy::Points;
 use super::targets::{ImageTargets, TargetTable, VideoTargets};
 use super::text_source::TextSources;
@@ -52,8 +52,9 @@ pub fn feature_cosines(
         for (n, field) in fields.spaces.iter().enumerate() {
             let (Some(field), None) = (field, found[n]) else { continue };
             let heads = HeadModel::new(&field.heads, Precision::F32);
-            let rendered = |frame: &Frame| {
-                let sources = trace_frame(model, frame, sampling, config.samples);
+            let rendered = |frame: &Frame, wanted: &[Wanted]| {
+                let sources =
+                    trace_pixels(model, frame, wanted.iter().map(|w| w.0), sampling, config.samples);
                 // Fields with scales are held against patches of one scale, at the size that this is at every pixel.
                 let height = SHARE * (f64::from(frame.camera.height) / frame.camera.fy) as f32;
                 let size = |ray: usize| height * sources.depth[ray];
@@ -151,6 +152,9 @@ fn spread<'a>(all: &'a [&'a Frame]) -> impl Iterator<Item = &'a Frame> {
     (0..count).map(move |n| all[n * all.len() / count])
 }
 
+/// Number of a pixel and its target.
+type Wanted = (usize, Blend);
+
 struct Compared<'a> {
     compressor: &'a Compressor,
     frames: &'a [Frame],
@@ -161,14 +165,14 @@ impl Compared<'_> {
         &self,
         table: &TargetTable,
         with: Vec<usize>,
-        rendered: impl Fn(&Frame) -> Vec<f32>,
+        rendered: impl Fn(&Frame, &[Wanted]) -> Vec<f32>,
         target: impl Fn(usize, u32, u32) -> Option<Blend> + Sync,
     ) -> Option<f64> {
         let (full, dim) = (table.dim(), self.compressor.dim());
         let (mut sum, mut count) = (0.0, 0usize);
         for n in with {
             let camera = &self.frames[n].camera;
-            let wanted: Vec<(usize, Blend)> = (0..camera.height)
+            let wanted: Vec<Wanted> = (0..camera.height)
                 .step_by(STRIDE as usize)
                 .flat_map(|y| (0..camera.width).step_by(STRIDE as usize).map(move |x| (x, y)))
                 .filter_map(|(x, y)| Some(((y * camera.width + x) as usize, target(n, x, y)?)))
@@ -176,13 +180,14 @@ impl Compared<'_> {
             if wanted.is_empty() {
                 continue;
             }
-            let codes = rendered(&self.frames[n]);
+            let codes = rendered(&self.frames[n], &wanted);
             let cosines: Vec<f64> = wanted
                 .par_iter()
-                .map(|(pixel, blend)| {
+                .zip(codes.par_chunks_exact(dim))
+                .map(|((_, blend), code)| {
                     let (mut truth, mut ours) = (vec![0.0; full], vec![0.0; full]);
                     table.blend(blend, &mut truth);
-                    self.compressor.decode(&codes[pixel * dim..][..dim], &mut ours);
+                    self.compressor.decode(code, &mut ours);
                     cosine(&truth, &ours)
                 })
                 .collect();

@@ -112,7 +112,7 @@ impl Default for SemanticsConfig {
             hidden: 64,
             layers: 1,
             steps: 1500,
-            joint_steps: 100,
+            joint_steps: 60,
             joint_weight: 20.0,
             rays: 4096,
             cached_rays: 800_000,

@@ -8,6 +8,7 @@ mod error;
 pub mod loss;
 pub mod pixels;
 mod schedule;
+mod session;
 pub mod step;
 pub mod table_pass;
 #[cfg(test)]
@@ -17,4 +18,5 @@ mod trainer;
 pub use self::checkpoint::Trained;
 pub use self::config::{StreamChoice, TrainConfig};
 pub use self::error::TrainError;
+pub use self::session::Session;
 pub use self::trainer::{Control, Progress, TrainReport, Trainer};

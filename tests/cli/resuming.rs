@@ -36,15 +36,20 @@ fn a_stopped_run_that_goes_on_gives_the_bytes_of_an_uninterrupted_one() {
     // Once while what stays is trained alone, and once when all streams are.
     for (patience, step) in [(1, 50), (5, 300)] {
         let observer = &mut Impatient { patience };
-        let trained = pipeline::train(&scene, &config, &stopped, false, observer).unwrap();
-        assert_eq!((trained.progress.step, trained.progress.finished), (step, false));
+        let session = pipeline::train(&scene, &config, &stopped, false, observer).unwrap();
+        let progress = &session.trained().progress;
+        assert_eq!((progress.step, progress.finished), (step, false));
     }
-    let trained = pipeline::train(&scene, &config, &stopped, false, &mut ()).unwrap();
-    assert_eq!((trained.progress.step, trained.progress.finished), (400, true));
+    let session = pipeline::train(&scene, &config, &stopped, false, &mut ()).unwrap();
+    let progress = &session.trained().progress;
+    assert_eq!((progress.step, progress.finished), (400, true));
+    // Features from the checkpoint, as after a stop between the two.
+    drop(session);
+    let session = pipeline::train(&scene, &config, &stopped, false, &mut ()).unwrap();
     let cost = &mut Cost::default();
     let map = stopped.map();
     let (fields, trained) =
-        pipeline::train_features(&scene, trained, &config, &stopped, &mut ()).unwrap().unwrap();
+        pipeline::train_features(&scene, session, &config, &stopped, &mut ()).unwrap().unwrap();
     pipeline::export_map(&scene, &trained, Some(&fields), &config, &map, &Format::ALL, cost, &mut ())
         .unwrap()
         .unwrap();

@@ -17,7 +17,7 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-pub use self::render::{FeatureImage, render_features, trace_frame};
+pub use self::render::{FeatureImage, render_features, trace_frame, trace_pixels};
 use super::config::{HeadStreamConfig, SemanticsConfig};
 use crate::field::hashgrid::{FEATURES, HashGrid, Row};
 use crate::field::mlp::{Activations, Mlp, Packed, Precision};

@@ -30,14 +30,21 @@ pub struct FeatureImage {
 
 /// Where the light of every pixel of a frame comes from.
 pub fn trace_frame(model: &Model, frame: &Frame, sampling: &Sampling, keep: usize) -> Sources {
-    let view = View::new(model.field, frame);
-    Sources::trace(model, &[view], &frame_rays(frame), sampling, keep)
+    let pixels = frame.camera.width as usize * frame.camera.height as usize;
+    trace_pixels(model, frame, 0..pixels, sampling, keep)
 }
 
-/// The rays of all pixels of a frame.
-fn frame_rays(frame: &Frame) -> Vec<RayInput> {
-    let directions = pixel_directions(&frame.camera);
-    (0..directions.len()).map(|n| pixel_ray(frame, &directions, 0, n)).collect()
+/// Where the light of some pixels of a frame comes from.
+pub fn trace_pixels(
+    model: &Model,
+    frame: &Frame,
+    pixels: impl Iterator<Item = usize>,
+    sampling: &Sampling,
+    keep: usize,
+) -> Sources {
+    let (view, directions) = (View::new(model.field, frame), pixel_directions(&frame.camera));
+    let rays: Vec<RayInput> = pixels.map(|n| pixel_ray(frame, &directions, 0, n)).collect();
+    Sources::trace(model, &[view], &rays, sampling, keep)
 }
 
 /// The ray of pixel number `pixel` of a frame that is view number `view`.

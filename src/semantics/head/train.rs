@@ -24,7 +24,7 @@ use crate::semantics::config::SemanticsConfig;
 use crate::semantics::error::SemanticsError;
 use crate::semantics::fields::{SemanticFields, SpaceField};
 use crate::semantics::targets::{EncodedTable, ImageMode, ImageTargets, PartTargets, VideoTargets};
-use crate::train::{Trained, Trainer, step};
+use crate::train::{Session, Trained, Trainer, step};
 
 /// Streams of random numbers: which pixels are kept, and the steps of each space.
 const PIXEL_STREAM: u64 = 0x7069_7865;
@@ -100,8 +100,8 @@ impl Targets {
 type Report<'a> = dyn FnMut(&HeadProgress) -> ControlFlow<()> + 'a;
 
 /// Trains the fields of all spaces that the scene has features of; what is absent is told in
-/// [`SemanticFields::skipped`]. Where geometry was trained with them, it is that of the trainer, which resumed that of
-/// `run`; nothing is stored.
+/// [`SemanticFields::skipped`]. Geometry is trained with them in the end, where settings want it; `run` is where its
+/// checkpoint is. Nothing is stored.
 ///
 /// `None` if `report` says stop.
 ///
@@ -109,17 +109,17 @@ type Report<'a> = dyn FnMut(&HeadProgress) -> ControlFlow<()> + 'a;
 /// [`SemanticsError`] for features that cannot be used, [`SemanticsError::Train`] if geometry cannot be trained on.
 pub fn train_features(
     scene: &Scene,
-    trained: &Trained,
+    session: &mut Session,
     config: &Config,
     run: &Path,
     report: &mut Report,
-) -> Result<Option<(SemanticFields, Option<Trainer>)>, SemanticsError> {
-    let settings = &config.semantics;
+) -> Result<Option<SemanticFields>, SemanticsError> {
+    let (settings, trained) = (&config.semantics, session.trained());
     let mut fields = SemanticFields::empty(settings.clone(), trained);
     if !settings.enabled {
         fields.skip("clip", "semantics.enabled is off");
         fields.skip("egovideo", "semantics.enabled is off");
-        return Ok(Some((fields, None)));
+        return Ok(Some(fields));
     }
     let frames: Vec<Frame> = scene.frames.iter().filter(|f| f.split == Split::Train).cloned().collect();
     let targets = Targets::load(scene, &frames, settings)?;
@@ -151,21 +151,19 @@ pub fn train_features(
         }
     }
     drop(sources);
-    let mut trainer = None;
     let usable = spaces.iter().any(|s| !s.targets.usable.is_empty());
     if settings.joint_steps > 0 && trained.progress.joint == 0 && usable {
-        let mut resumed = Trainer::resume(scene, config, run)?;
-        if train_jointly(&mut spaces, &mut resumed, &pixels, &frames, config, &mut alone)?.is_break() {
+        let trainer = session.open(scene, config, run)?;
+        if train_jointly(&mut spaces, trainer, &pixels, &frames, config, &mut alone)?.is_break() {
             return Ok(None);
         }
-        fields.belongs_to(resumed.trained());
-        trainer = Some(resumed);
+        fields.belongs_to(trainer.trained());
     }
     for SpaceTraining { space, heads, compressor, .. } in spaces {
         let model = store.model(space).map(str::to_owned);
         fields.spaces[space as usize] = Some(SpaceField { space, heads, compressor, model });
     }
-    Ok(Some((fields, trainer)))
+    Ok(Some(fields))
 }
 
 /// Trains everything: by turns geometry alone, by all its losses, and geometry with the features of one space.
