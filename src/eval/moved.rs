@@ -135,12 +135,11 @@ fn mean(scores: &[f32], inside: impl Fn(usize) -> bool) -> Option<f64> {
     (count >= MIN_PIXELS).then(|| sum / count as f64)
 }
 
+/// Instance and depth of every pixel.
+type Seen = (Vec<u32>, Vec<f32>);
+
 /// True instances and depth of a frame; `None` if either is missing.
-fn seen(
-    scene: &Scene,
-    truth: &PhraseTruth,
-    frame: &Frame,
-) -> Result<Option<(Vec<u32>, Vec<f32>)>, EvalError> {
+fn seen(scene: &Scene, truth: &PhraseTruth, frame: &Frame) -> Result<Option<Seen>, EvalError> {
     let path = truth.root.join("instances").join(format!("{}.png", frame.stem));
     let Some(instances) = labels(&path, frame)? else { return Ok(None) };
     Ok(frame.load_depth(scene.depth_unit)?.map(|depth| (instances, depth)))
