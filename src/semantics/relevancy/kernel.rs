@@ -1,7 +1,9 @@
 //! Products of many points with a few phrases, and the scores that follow.
 //!
-//! Lanes are phrases: a point's numbers are broadcast one after the other and multiplied with the phrases' numbers of
-//! that dimension. So points stay as they are stored, and there is no sum across lanes but the point's own length.
+//! For short features lanes are phrases: a point's numbers are broadcast one after the other and multiplied with the
+//! phrases' numbers of that dimension. So points stay as they are stored, and there is no sum across lanes but the
+//! point's own length. For long ones and few phrases lanes are dimensions: half of the lanes would have no phrase, and
+//! sums across lanes are few beside the products.
 
 use half::f16;
 use half::slice::HalfFloatSliceExt;
@@ -17,6 +19,13 @@ const BLOCK: usize = 64;
 /// Products per point are padded to this: one AVX-512 vector.
 const PADDING: usize = 16;
 
+/// Features from this length on are long; a multiple of the lanes' number is needed as well.
+const LONG: usize = 128;
+/// Phrases that are held against long features together.
+const FEW: usize = 8;
+/// Points that share a phrase's numbers then.
+const PAIR: usize = 2;
+
 /// Below this share of its summands, a squared length in f32 has lost digits; the point is computed again in f64.
 const CANCELLED: f32 = 0.05;
 /// Below this share, it is rounding in f64 of numbers that were stored as f32: the feature has vanished.
@@ -26,6 +35,8 @@ const VANISHED: f64 = 1e-12;
 pub(super) struct Packed {
     /// `[dim, stride]`: of each dimension, the numbers of all phrases, then that of the norm's linear part.
     columns: Vec<f32>,
+    /// `[FEW, dim]`: the same phrase by phrase, if features are long and phrases few; else empty.
+    rows: Vec<f32>,
     /// `[stride]`: what products start from.
     offsets: Vec<f32>,
     dim: usize,
@@ -50,7 +61,14 @@ impl Packed {
             columns[k * stride + used - 1] = 2.0 * v;
         }
         offsets[used - 1] = queries.norm.constant;
-        Self { columns, offsets, dim, stride, used }
+        let mut rows = Vec::new();
+        if dim >= LONG && dim.is_multiple_of(PADDING) && used <= FEW {
+            rows.resize(FEW * dim, 0.0);
+            for (n, row) in rows.chunks_exact_mut(dim).enumerate() {
+                row.iter_mut().zip(columns.chunks_exact(stride)).for_each(|(r, column)| *r = column[n]);
+            }
+        }
+        Self { columns, rows, offsets, dim, stride, used }
     }
 }
 
@@ -105,12 +123,19 @@ impl WithSimd for Run<'_, '_> {
                     &wide
                 }
             };
-            for (n, rows) in rows.chunks_exact(TOGETHER * dim).enumerate() {
-                let out = &mut products[n * TOGETHER * stride..][..TOGETHER * stride];
-                multiply(simd, packed, rows, out);
-            }
-            for (square, row) in squares.iter_mut().zip(rows.chunks_exact(dim)) {
-                *square = squared(simd, row);
+            if packed.rows.is_empty() {
+                for (n, rows) in rows.chunks_exact(TOGETHER * dim).enumerate() {
+                    let out = &mut products[n * TOGETHER * stride..][..TOGETHER * stride];
+                    multiply(simd, packed, rows, out);
+                }
+                for (square, row) in squares.iter_mut().zip(rows.chunks_exact(dim)) {
+                    *square = squared(simd, row);
+                }
+            } else {
+                let pairs = products.chunks_exact_mut(PAIR * stride).zip(squares.as_chunks_mut::<PAIR>().0);
+                for ((products, squares), rows) in pairs.zip(rows.chunks_exact(PAIR * dim)) {
+                    multiply_long(simd, packed, rows, products, squares);
+                }
             }
             judge(queries, packed, &products, &squares, &mut judged);
             coverage[start..start + count].fill(1.0);
@@ -163,16 +188,53 @@ fn multiply<S: Simd>(simd: S, packed: &Packed, rows: &[f32], out: &mut [f32]) {
     let columns = S::as_simd_f32s(&packed.columns).0;
     let offsets = S::as_simd_f32s(&packed.offsets).0;
     let out = S::as_mut_simd_f32s(out).0;
-    let rows: [&[f32]; TOGETHER] = std::array::from_fn(|p| &rows[p * dim..(p + 1) * dim]);
+    let [a, b, c, d, e, f, g, h]: [&[f32]; TOGETHER] = std::array::from_fn(|p| &rows[p * dim..(p + 1) * dim]);
     for v in 0..used {
         let mut sums = [offsets[v]; TOGETHER];
-        for (k, column) in columns.iter().skip(v).step_by(vectors).enumerate().take(dim) {
+        // Zipped, since an index into each row would be checked for every number.
+        let rows = a.iter().zip(b).zip(c).zip(d).zip(e).zip(f).zip(g).zip(h);
+        for (column, (((((((a, b), c), d), e), f), g), h)) in columns.chunks_exact(vectors).zip(rows) {
+            let (column, values) = (column[v], [a, b, c, d, e, f, g, h]);
             for p in 0..TOGETHER {
-                sums[p] = simd.mul_add_e_f32s(simd.splat_f32s(rows[p][k]), *column, sums[p]);
+                sums[p] = simd.mul_add_e_f32s(simd.splat_f32s(*values[p]), column, sums[p]);
             }
         }
         for p in 0..TOGETHER {
             out[p * vectors + v] = sums[p];
+        }
+    }
+}
+
+/// Products of two long points `[2, dim]` with all rows, to `out` `[2, stride]`, and their |z|².
+#[inline(always)]
+fn multiply_long<S: Simd>(
+    simd: S,
+    packed: &Packed,
+    rows: &[f32],
+    out: &mut [f32],
+    squares: &mut [f32; PAIR],
+) {
+    let Packed { dim, stride, used, .. } = *packed;
+    let phrases: [&[S::f32s]; FEW] =
+        std::array::from_fn(|n| S::as_simd_f32s(&packed.rows[n * dim..(n + 1) * dim]).0);
+    let [x, y] = [0, 1].map(|p| S::as_simd_f32s(&rows[p * dim..(p + 1) * dim]).0);
+    let zero = simd.splat_f32s(0.0);
+    let (mut sums, mut lengths) = ([[zero; FEW]; PAIR], [zero; PAIR]);
+    let [a, b, c, d, e, f, g, h] = phrases;
+    let phrases = a.iter().zip(b).zip(c).zip(d).zip(e).zip(f).zip(g).zip(h);
+    for ((x, y), (((((((a, b), c), d), e), f), g), h)) in x.iter().zip(y).zip(phrases) {
+        let phrases = [a, b, c, d, e, f, g, h];
+        for (p, point) in [x, y].into_iter().enumerate() {
+            lengths[p] = simd.mul_add_e_f32s(*point, *point, lengths[p]);
+            for n in 0..FEW {
+                sums[p][n] = simd.mul_add_e_f32s(*point, *phrases[n], sums[p][n]);
+            }
+        }
+    }
+    for p in 0..PAIR {
+        squares[p] = simd.reduce_sum_f32s(lengths[p]);
+        for n in 0..used {
+            out[p * stride + n] = packed.offsets[n] + simd.reduce_sum_f32s(sums[p][n]);
         }
     }
 }

@@ -25,8 +25,15 @@ fn formula(feature: &[f32], wanted: &[f32], canonical: &[&[f32]], temperature: f
 }
 
 /// `dim`, phrases, canonical phrases, points: blocks of 64 and what is left of them, one vector of columns and two.
-const SHAPES: [(usize, usize, usize, usize); 6] =
-    [(3, 1, 1, 1), (8, 1, 5, 64), (32, 1, 5, 1000), (33, 9, 7, 130), (32, 20, 5, 77), (512, 2, 4, 4200)];
+const SHAPES: [(usize, usize, usize, usize); 7] = [
+    (3, 1, 1, 1),
+    (8, 1, 5, 64),
+    (32, 1, 5, 1000),
+    (33, 9, 7, 130),
+    (32, 20, 5, 77),
+    (144, 3, 4, 97),
+    (512, 2, 4, 4200),
+];
 
 #[test]
 fn scores_are_those_of_the_formula() {
