@@ -46,6 +46,7 @@ pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
     config.train.streams = StreamChoice::All;
     // Its surrogate features are simple: a fifth of the work tells the things apart.
     config.semantics.steps = 400;
+    config.semantics.joint_steps = 20;
     config.semantics.rays = 2048;
     config.semantics.cached_rays = 200_000;
     config.time_budget_s = Some(args.time_budget.as_secs_f64());
