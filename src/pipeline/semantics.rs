@@ -75,6 +75,7 @@ pub(super) struct SemanticEvaluation<'a> {
     config: &'a Config,
     fields: Option<&'a SemanticFields>,
     truth: PhraseTruth,
+    text: TextSources,
     phrases: PhraseEvaluation<'a>,
     moved: MovedObjects,
 }
@@ -95,7 +96,7 @@ impl<'a> SemanticEvaluation<'a> {
             true => MovedObjects::default(),
             false => MovedObjects::read(scene, &truth)?,
         };
-        Ok(Self { scene, config, fields, truth, phrases, moved })
+        Ok(Self { scene, config, fields, truth, text, phrases, moved })
     }
 
     /// Scores a frame; the layers that show it.
@@ -138,7 +139,7 @@ impl<'a> SemanticEvaluation<'a> {
                 None => metrics.absent.insert(name, "no frame has features of this space".into()),
             };
         }
-        let compression = compression(self.scene, fields, &TextSources::of_scene(self.scene)?)?;
+        let compression = compression(self.scene, fields, &self.text)?;
         let named = Space::ALL.into_iter().zip(compression);
         Ok(named.filter_map(|(space, c)| Some((space.name().to_owned(), c?))).collect())
     }

@@ -18,7 +18,7 @@ use super::noise::Rng;
 use super::render::Picture;
 use super::room::Thing;
 use super::write::{png, write_json};
-use super::{Kitchen, SynthError, SynthOptions};
+use super::{Kitchen, Shot, SynthError, SynthOptions};
 use crate::error::FileError;
 use crate::scene::features::{Space, normalise};
 use crate::semantics::slug;
@@ -159,22 +159,16 @@ impl Models {
     }
 
     /// Everything about one frame; what the instances are is true.
-    pub(super) fn frame(
-        &self,
-        out: &Path,
-        kitchen: &Kitchen,
-        options: &SynthOptions,
-        frame: u32,
-        picture: &Picture,
-    ) -> Result<(), SynthError> {
-        if !has_features(options, frame) {
+    pub(super) fn frame(&self, shot: &Shot, kitchen: &Kitchen) -> Result<(), SynthError> {
+        let Shot { out, options, frame, picture } = shot;
+        if !has_features(options, *frame) {
             return Ok(());
         }
-        let mut rng = Rng::new(self.seed ^ (u64::from(frame) << 32) ^ 0x64_65_73_63);
+        let mut rng = Rng::new(self.seed ^ (u64::from(*frame) << 32) ^ 0x64_65_73_63);
         let view = View { picture, width: options.width, height: options.height, things: self.parts.len() };
         let stem = format!("{frame:06}");
         self.masks(&out.join("language_features"), &stem, &view, &mut rng)?;
-        let held = kitchen.story.carried(options.time(frame) as f32).map(|prop| kitchen.prop_instance(prop));
+        let held = kitchen.story.carried(options.time(*frame) as f32).map(|prop| kitchen.prop_instance(prop));
         self.patches(&out.join("video_features"), &stem, &view, held, &mut rng)?;
         self.cells(&out.join("dino_features"), &stem, &view, &mut rng)?;
         let hands = (1..=2).map(|n| kitchen.prop_instance(kitchen.props.len()) + n - 1);
@@ -272,13 +266,8 @@ fn action(thing: &Thing) -> Option<String> {
 }
 
 /// True regions of the actions in a test frame: `gt/affordances/<slug>/<stem>.png`.
-pub(super) fn affordance_masks(
-    out: &Path,
-    things: &[Thing],
-    options: &SynthOptions,
-    frame: u32,
-    picture: &Picture,
-) -> Result<(), SynthError> {
+pub(super) fn affordance_masks(shot: &Shot, things: &[Thing]) -> Result<(), SynthError> {
+    let Shot { out, options, frame, picture } = shot;
     for (phrase, queries) in ACTIONS {
         let inside = |i: &u16| *i > 0 && queries.contains(&things[usize::from(*i) - 1].query);
         let mask: Vec<u8> = picture.instance.iter().map(|i| 255 * u8::from(inside(i))).collect();

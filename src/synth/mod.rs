@@ -223,6 +223,15 @@ impl Kitchen {
     }
 }
 
+/// A frame of the scene that is being made, and what is seen in it.
+struct Shot<'a> {
+    /// Folder of the scene.
+    out: &'a Path,
+    options: &'a SynthOptions,
+    frame: u32,
+    picture: Picture,
+}
+
 /// Generates a scene folder at `out`, which must not exist or be empty.
 ///
 /// `transforms.json` is written last and at once: a folder without it is not a scene, so an interrupted
@@ -238,12 +247,12 @@ pub fn generate(options: &SynthOptions, out: &Path) -> Result<SynthSummary, Synt
     let lens = options.lens();
     let (models, things) = (Models::new(&kitchen, options.seed), kitchen.things());
     (0..options.frames).into_par_iter().try_for_each(|frame| {
-        let picture = kitchen.picture(&lens, options.time(frame));
-        write::frame(out, &kitchen, options, frame, &picture)?;
+        let shot = Shot { out, options, frame, picture: kitchen.picture(&lens, options.time(frame)) };
+        write::frame(&shot, &kitchen)?;
         if options.is_test(frame) {
-            features::affordance_masks(out, &things, options, frame, &picture)?;
+            features::affordance_masks(&shot, &things)?;
         }
-        models.frame(out, &kitchen, options, frame, &picture)
+        models.frame(&shot, &kitchen)
     })?;
     models.descriptions(out, options)?;
     write::meshes(out, &kitchen, options)?;

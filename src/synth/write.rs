@@ -12,8 +12,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use serde_json::{Map, Value, json};
 
 use super::mesh::Mesh;
-use super::render::Picture;
-use super::{Kitchen, SynthError, SynthOptions, features};
+use super::{Kitchen, Shot, SynthError, SynthOptions, features};
 use crate::error::FileError;
 
 /// Millimetres per metre: depth is stored as 16-bit millimetres.
@@ -37,13 +36,8 @@ pub(super) fn prepare(out: &Path) -> Result<(), SynthError> {
 }
 
 /// Image, depth, streams and instances of one frame.
-pub(super) fn frame(
-    out: &Path,
-    kitchen: &Kitchen,
-    options: &SynthOptions,
-    frame: u32,
-    picture: &Picture,
-) -> Result<(), SynthError> {
+pub(super) fn frame(shot: &Shot, kitchen: &Kitchen) -> Result<(), SynthError> {
+    let Shot { out, options, frame, picture } = shot;
     let name = format!("{frame:06}.png");
     let depth: Vec<u16> =
         picture.depth.iter().map(|z| (z * DEPTH_UNITS).round().min(65535.0) as u16).collect();

@@ -230,6 +230,7 @@ impl Trainer {
         self.trained.save(run, self.config.train.grid_cells, Some(&self.optimiser))
     }
 
+    /// Rates and savings are those of the schedule: joint steps after it are not counted.
     fn count(&mut self, report: &StepReport) {
         let progress = &mut self.trained.progress;
         progress.rays += report.rays as u64;
@@ -271,8 +272,8 @@ impl Trainer {
         tracing::info!(a.frames, a.rotation, a.translation, lens = ?a.lens, "frames aligned");
     }
 
-    /// Finds the depth of the training frames by stereo where that was not done yet: from where they are by now, or from where they were when a
-    /// training that goes on did so.
+    /// Finds the depth of the training frames by stereo, unless that is done or not wanted: from where they are by now,
+    /// or from where they were when a training that goes on did so.
     fn look_at_depth(&mut self) {
         if !self.pixels.stereo.is_empty() || self.config.train.stereo_at >= 1.0 {
             return;

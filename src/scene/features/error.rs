@@ -9,7 +9,7 @@ use crate::scene::SceneError;
 #[non_exhaustive]
 pub enum FeatureError {
     /// A `.npy` file cannot be read, is damaged or of a type that is not supported.
-    #[error(transparent)]
+    #[error("{0}; make the file again")]
     Array(Box<divff_exporters::Error>),
     /// A `meta.json` or a picture cannot be read or makes no sense.
     #[error(transparent)]
