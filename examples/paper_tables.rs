@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! cargo run --release --example paper_tables -- SCENE --out DIR [--preset standard] [--set a.b=c]
-//!     [--rows static,patches,masks,masks+boxes] [--detections F.json] [--text-encoder FOLDER]
+//!     [--rows static,patches,masks,masks+boxes] [--seeds 3] [--detections F.json] [--text-encoder FOLDER]
 //! ```
 //!
 //! Geometry and features are trained once and kept in `DIR`; Ctrl-C stops, and the same command goes on. The results are
@@ -17,7 +17,7 @@ use clap::{Parser, ValueEnum};
 use divff::config::{Config, Preset};
 use divff::eval::{Detections, PhraseTruth};
 use divff::pipeline::folder::{create_writable, write_json};
-use divff::pipeline::tables::{Variant, paper_tables};
+use divff::pipeline::tables::{Comparison, Variant, paper_tables};
 use divff::pipeline::{Event, Observer};
 use divff::scene::Scene;
 use divff::scene::features::Space;
@@ -41,6 +41,9 @@ struct Arguments {
     /// Fields to compare
     #[arg(long, value_delimiter = ',', value_parser = variant, default_value = "static,patches,masks,masks+boxes")]
     rows: Vec<Variant>,
+    /// How often the features of each row are trained, from a seed of their own each time
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    seeds: u32,
     /// What somebody's detector found in the rendered test views, in COCO's form; a row each
     #[arg(long, value_name = "F.json")]
     detections: Vec<PathBuf>,
@@ -91,8 +94,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
     }
     create_writable(&arguments.out)?;
-    let (out, rows, log) = (&arguments.out, &arguments.rows, &mut Log::default());
-    let Some(tables) = paper_tables(&scene, &config, out, rows, &detections, &text, log)? else {
+    let (out, seeds) = (&arguments.out, arguments.seeds);
+    let (variants, detections) = (&arguments.rows[..], &detections[..]);
+    let asked = Comparison { scene: &scene, base: &config, out, variants, detections, text: &text, seeds };
+    let Some(tables) = paper_tables(&asked, &mut Log::default())? else {
         return Err("stopped; the same command goes on from there".into());
     };
     write_json(&out.join("tables.json"), &tables)?;

@@ -12,7 +12,7 @@ use crate::config::Config;
 use crate::eval::{self, Detections, NOTHING, PhraseTruth, ScoreSums, THRESHOLD, Task};
 use crate::render::forward::Model;
 use crate::render::image::render;
-use crate::report::tables::{OrderCheck, TableRow, Tables};
+use crate::report::tables::{OrderCheck, OrderedRow, TableRow, Tables};
 use crate::scene::features::Space;
 use crate::scene::{Frame, Scene, Split};
 use crate::semantics::TextSources;
@@ -94,35 +94,47 @@ struct Geometry {
     psnr: Option<f64>,
 }
 
-/// Trains what the rows need, in `out`, and measures them; rows come in the paper's order. `None` if the observer said
-/// stop: the same call goes on from there.
+/// What is compared, on what.
+#[derive(Clone, Copy)]
+pub struct Comparison<'a> {
+    /// The scene.
+    pub scene: &'a Scene,
+    /// Settings that all rows have in common.
+    pub base: &'a Config,
+    /// Where everything that is trained is kept.
+    pub out: &'a Path,
+    /// Fields to compare.
+    pub variants: &'a [Variant],
+    /// What detectors found; a row each.
+    pub detections: &'a [Detections],
+    /// Where embeddings of phrases come from.
+    pub text: &'a TextSources,
+    /// How often features are trained, each time from another seed; at least 1. Geometry is trained once.
+    pub seeds: u32,
+}
+
+/// Trains what the rows need and measures them; rows come in the paper's order. `None` if the observer said stop: the same
+/// call goes on from there.
 ///
-/// `base` holds the settings that all rows have in common.
-///
-/// A row whose phrases do not all have an embedding in `text` has no figure and says so: means over different phrases
-/// could not be compared.
+/// A row whose phrases do not all have an embedding has no figure and says so: means over different phrases could not be
+/// compared.
 ///
 /// # Errors
 /// [`PipelineError`]: the first thing that went wrong; what was finished before it stays.
 pub fn paper_tables(
-    scene: &Scene,
-    base: &Config,
-    out: &Path,
-    variants: &[Variant],
-    detections: &[Detections],
-    text: &TextSources,
+    asked: &Comparison,
     observer: &mut dyn Observer,
 ) -> Result<Option<Tables>, PipelineError> {
+    let Comparison { scene, base, out, variants, detections, .. } = *asked;
     let truth = PhraseTruth::read(scene)?;
     let mut shared: Option<Geometry> = None;
     // Per task: variant (none for detections), space and row.
     let mut found: [Vec<(Option<Variant>, Space, TableRow)>; 2] = Default::default();
     for variant in Variant::ALL.into_iter().filter(|v| variants.contains(v)) {
         let config = variant.settings(base);
-        let run = RunFolder::new(out.join(variant.name()));
         let own;
         let geometry = if variant == Variant::Static {
-            own = geometry(scene, &config, &run, observer)?;
+            own = geometry(scene, &config, &RunFolder::new(out.join(variant.name())), observer)?;
             own.as_ref()
         } else {
             if shared.is_none() {
@@ -133,10 +145,15 @@ pub fn paper_tables(
             shared.as_ref()
         };
         let Some(geometry) = geometry else { return Ok(None) };
-        let Some(rows) = rows(scene, &truth, geometry, &config, variant, &run, text, observer)? else {
-            return Ok(None);
-        };
-        for ((task, space), row) in variant.asked().iter().zip(rows) {
+        let mut repeats = Vec::new();
+        for repeat in 0..asked.seeds.max(1) {
+            let Some(rows) = rows(asked, &truth, geometry, variant, repeat, observer)? else {
+                return Ok(None);
+            };
+            repeats.push(rows);
+        }
+        for (n, (task, space)) in variant.asked().iter().enumerate() {
+            let row = TableRow::mean(repeats.iter().map(|rows| rows[n].clone()));
             found[*task as usize].push((Some(variant), *space, row));
         }
     }
@@ -151,7 +168,7 @@ pub fn paper_tables(
             found[task as usize].insert(at + n, (None, Space::Clip, row));
         }
     }
-    Ok(Some(tables(scene, found)))
+    Ok(Some(tables(asked, found)))
 }
 
 /// Trains a geometry, or takes the one that is there, and measures its pictures.
@@ -184,26 +201,29 @@ fn geometry(
     Ok((!observer.stop()).then_some(Geometry { trained, psnr }))
 }
 
-/// The rows that one variant gives, in the order of [`Variant::asked`].
-#[allow(clippy::too_many_arguments)]
+/// The rows that one variant gives, in the order of [`Variant::asked`]; `repeat` counts the trainings of its features.
 fn rows(
-    scene: &Scene,
+    asked: &Comparison,
     truth: &PhraseTruth,
     geometry: &Geometry,
-    config: &Config,
     variant: Variant,
-    run: &RunFolder,
-    text: &TextSources,
+    repeat: u32,
     observer: &mut dyn Observer,
 ) -> Result<Option<Vec<TableRow>>, PipelineError> {
+    let Comparison { scene, base, out, text, .. } = *asked;
+    let mut config = variant.settings(base);
+    config.seed = config.seed.wrapping_add(repeat.into());
+    let run = RunFolder::new(out.join(match repeat {
+        0 => variant.name().to_owned(),
+        _ => format!("{}-{}", variant.name(), repeat + 1),
+    }));
     let trained = &geometry.trained;
     let session = Session::Over(Box::new(trained.clone()));
-    let found = train_features(scene, session, config, run, observer)?;
-    let Some((fields, _)) = found else { return Ok(None) };
+    let Some((fields, _)) = train_features(scene, session, &config, &run, observer)? else { return Ok(None) };
     let without = |asked: &(Task, Space)| unknown(text, &truth.phrases(asked.0), asked.1);
     let asked: Vec<(Task, Space)> =
         variant.asked().iter().filter(|a| without(a).is_none()).copied().collect();
-    let mut phrases = PhraseEvaluation::new(truth.clone(), Some(&fields), config, &asked, text)?;
+    let mut phrases = PhraseEvaluation::new(truth.clone(), Some(&fields), &config, &asked, text)?;
     observer.event(&Event::Stage(Stage::Evaluating));
     let model = Model::new(&trained.field, &trained.grids, [true; 3]);
     let sampling = config.train.render_sampling();
@@ -268,13 +288,14 @@ fn row(method: String, sums: &ScoreSums, phrases: &[String], task: Task) -> Tabl
     }
 }
 
-fn tables(scene: &Scene, found: [Vec<(Option<Variant>, Space, TableRow)>; 2]) -> Tables {
-    let miou = |task: Task, variant: Variant, space: Space| {
+fn tables(asked: &Comparison, found: [Vec<(Option<Variant>, Space, TableRow)>; 2]) -> Tables {
+    let scene = asked.scene;
+    let row = |task: Task, variant: Variant, space: Space| {
         let row = found[task as usize].iter().find(|r| r.0 == Some(variant) && r.1 == space);
-        row.and_then(|r| r.2.miou)
+        row.map(|r| &r.2)
     };
-    let order = Variant::ALL.map(|v| (v.name().to_owned(), miou(Task::Objects, v, Space::Clip)));
-    let full = |space| miou(Task::Affordances, Variant::MasksAndBoxes, space);
+    let order = Variant::ALL.map(|v| OrderedRow::new(v.name(), row(Task::Objects, v, Space::Clip)));
+    let full = |space| row(Task::Affordances, Variant::MasksAndBoxes, space)?.miou;
     let video_over_image = match (full(Space::Egovideo), full(Space::Clip)) {
         (Some(video), Some(image)) if image > 0.0 => Some(video / image),
         _ => None,
@@ -285,6 +306,7 @@ fn tables(scene: &Scene, found: [Vec<(Option<Variant>, Space, TableRow)>; 2]) ->
         scene: name.unwrap_or_else(|| scene.root.display().to_string()),
         test_frames: test_frames(scene).count(),
         threshold: THRESHOLD,
+        seeds: asked.seeds.max(1),
         objects,
         affordances,
         order: OrderCheck::new(order.to_vec()),

@@ -16,8 +16,10 @@ pub const VIDEO_OVER_IMAGE: f64 = 1.5;
 pub struct TableRow {
     /// As the paper calls it.
     pub method: String,
-    /// Mean over all objects or regions and test frames, 0–1.
+    /// Mean over all objects or regions and test frames, and over seeds, 0–1.
     pub miou: Option<f64>,
+    /// The mean's standard error, from how much the seeds differ.
+    pub miou_error: Option<f64>,
     /// Mean over the test frames of each phrase that covers 50 px in any.
     pub phrases: BTreeMap<String, f64>,
     /// dB of the geometry over all test pixels.
@@ -30,11 +32,53 @@ pub struct TableRow {
     pub absent: Option<String>,
 }
 
+impl TableRow {
+    /// Repeats of one row, which differ by their seeds.
+    ///
+    /// # Panics
+    /// If there are none.
+    pub fn mean(repeats: impl Iterator<Item = Self>) -> Self {
+        let repeats: Vec<Self> = repeats.collect();
+        let mut row = repeats[0].clone();
+        let of =
+            |value: &dyn Fn(&Self) -> Option<f64>| repeats.iter().map(value).collect::<Option<Vec<f64>>>();
+        let average = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+        row.miou_error = of(&|r| r.miou).filter(|v| v.len() > 1).map(|values| {
+            let (mean, n) = (average(&values), values.len() as f64);
+            (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0) / n).sqrt()
+        });
+        row.miou = of(&|r| r.miou).map(|v| average(&v));
+        row.feature_seconds = of(&|r| r.feature_seconds).map(|v| average(&v));
+        for (phrase, value) in &mut row.phrases {
+            *value = of(&|r| r.phrases.get(phrase).copied()).map_or(*value, |v| average(&v));
+        }
+        row
+    }
+}
+
+/// A row of [`OrderCheck`].
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct OrderedRow {
+    /// Short name.
+    pub name: String,
+    /// mIoU on objects.
+    pub miou: Option<f64>,
+    /// Its standard error.
+    pub error: Option<f64>,
+}
+
+impl OrderedRow {
+    /// What a row of the tables says, if it is there.
+    pub fn new(name: &str, row: Option<&TableRow>) -> Self {
+        Self { name: name.into(), miou: row.and_then(|r| r.miou), error: row.and_then(|r| r.miou_error) }
+    }
+}
+
 /// What one claim of the paper comes to.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct OrderCheck {
-    /// Rows in the order that the paper has from worst to best, and their mIoU on objects.
-    pub rows: Vec<(String, Option<f64>)>,
+    /// Rows in the order that the paper has from worst to best.
+    pub rows: Vec<OrderedRow>,
     /// Whether those that are there are in this order; `None` with fewer than two.
     pub holds: Option<bool>,
 }
@@ -48,6 +92,8 @@ pub struct Tables {
     pub test_frames: usize,
     /// A pixel belongs to a phrase where its score is above this, in every row.
     pub threshold: f32,
+    /// How often features were trained; figures are means over that.
+    pub seeds: u32,
     /// Dynamic objects, by their names.
     pub objects: Vec<TableRow>,
     /// Places of actions, by what is done.
@@ -59,12 +105,15 @@ pub struct Tables {
 }
 
 impl OrderCheck {
-    /// Whether `rows` rise; the last two may be equal.
-    pub fn new(rows: Vec<(String, Option<f64>)>) -> Self {
+    /// Whether `rows` rise. The last two may be equal: the last one counts as reaching the one before unless it is lower
+    /// by more than the standard error of their difference.
+    pub fn new(rows: Vec<OrderedRow>) -> Self {
         let last = rows.len().saturating_sub(1);
-        let there: Vec<(usize, f64)> = rows.iter().enumerate().filter_map(|(n, r)| Some((n, r.1?))).collect();
+        let there: Vec<(usize, f64)> =
+            rows.iter().enumerate().filter_map(|(n, r)| Some((n, r.miou?))).collect();
+        let noise = |n: usize| rows[n].error.unwrap_or(0.0);
         let rises = |w: &[(usize, f64)]| match w[1].0 == last && w[0].0 + 1 == last {
-            true => w[0].1 <= w[1].1,
+            true => w[0].1 <= w[1].1 + noise(w[0].0).hypot(noise(w[1].0)),
             false => w[0].1 < w[1].1,
         };
         let holds = (there.len() > 1).then(|| there.windows(2).all(rises));
@@ -74,7 +123,7 @@ impl OrderCheck {
     fn sentence(&self) -> String {
         let last = self.rows.len().saturating_sub(1);
         let mut claim = String::new();
-        for (n, (name, value)) in self.rows.iter().enumerate() {
+        for (n, row) in self.rows.iter().enumerate() {
             let sign = if n == 0 {
                 ""
             } else if n == last {
@@ -82,9 +131,9 @@ impl OrderCheck {
             } else {
                 " < "
             };
-            let _ = write!(claim, "{sign}{name} ({})", percent(*value));
+            let _ = write!(claim, "{sign}{} ({}{})", row.name, percent(row.miou), plus_minus(row.error));
         }
-        let missing = self.rows.iter().any(|r| r.1.is_none());
+        let missing = self.rows.iter().any(|r| r.miou.is_none());
         let verdict = match self.holds {
             Some(true) if missing => "holds for the rows that are there",
             Some(true) => "holds",
@@ -101,8 +150,13 @@ impl Tables {
         let mut out = format!(
             "# The paper's tables on {}\n\nmIoU in percent over {} test frames, where the truth covers 50 px or more; a pixel \
              is found where its score is above {THRESHOLD}, in every row. Phrases: mean over their frames. Rows of three \
-             streams share one geometry. Seconds are those of training: geometry, and the features of both spaces.\n",
-            self.scene, self.test_frames
+             streams share one geometry. Seconds are those of training: geometry, and the features of both spaces.{}\n",
+            self.scene,
+            self.test_frames,
+            match self.seeds {
+                1 => String::new(),
+                n => format!(" Features were trained from {n} seeds: means, ± the standard error."),
+            }
         );
         for (task, title) in
             [(Task::Objects, "Dynamic object segmentation"), (Task::Affordances, "Affordance segmentation")]
@@ -158,8 +212,9 @@ fn table(rows: &[TableRow]) -> String {
             |value: Option<f64>, digits: usize| value.map_or("–".into(), |v| format!("{v:.digits$}"));
         let _ = writeln!(
             out,
-            " {} | {} | {} | {} |",
+            " {}{} | {} | {} | {} |",
             cell(row, &|r| r.miou),
+            plus_minus(row.miou_error),
             number(row.psnr, 2),
             number(row.geometry_seconds, 0),
             number(row.feature_seconds, 0)
@@ -179,6 +234,11 @@ fn percent(value: Option<f64>) -> String {
     value.map_or("–".into(), |v| format!("{:.1}", 100.0 * v))
 }
 
+/// Nothing without an error.
+fn plus_minus(error: Option<f64>) -> String {
+    error.map_or(String::new(), |e| format!(" ± {:.1}", 100.0 * e))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -189,8 +249,35 @@ mod tests {
     }
 
     fn order(values: [Option<f64>; 4]) -> OrderCheck {
+        order_with(values, [None; 4])
+    }
+
+    fn order_with(values: [Option<f64>; 4], errors: [Option<f64>; 4]) -> OrderCheck {
         let names = ["static", "patches", "masks", "masks+boxes"];
-        OrderCheck::new(names.map(str::to_owned).into_iter().zip(values).collect())
+        let rows = names.into_iter().zip(values.into_iter().zip(errors));
+        OrderCheck::new(
+            rows.map(|(name, (miou, error))| OrderedRow { name: name.into(), miou, error }).collect(),
+        )
+    }
+
+    #[test]
+    fn repeats_are_averaged_and_their_spread_is_an_error() {
+        let one = |miou| TableRow { feature_seconds: Some(100.0 * miou), ..row("A", miou, miou / 2.0) };
+        let mean = TableRow::mean([0.5, 0.6, 0.7].map(one).into_iter());
+        assert!((mean.miou.unwrap() - 0.6).abs() < 1e-12 && (mean.phrases["mug"] - 0.3).abs() < 1e-12);
+        assert!((mean.feature_seconds.unwrap() - 60.0).abs() < 1e-9);
+        // Standard deviation 0.1, over √3.
+        assert!((mean.miou_error.unwrap() - 0.1 / 3f64.sqrt()).abs() < 1e-12);
+        assert_eq!(TableRow::mean([one(0.5)].into_iter()), one(0.5), "one repeat has no error");
+    }
+
+    #[test]
+    fn the_last_two_are_equal_within_their_noise() {
+        let values = [Some(0.0), Some(0.1), Some(0.51), Some(0.5)];
+        let holds = |e: f64| order_with(values, [None, None, Some(e), Some(e)]).holds.unwrap();
+        assert!(holds(0.008) && !holds(0.006) && !order(values).holds.unwrap());
+        let noisy = order_with([Some(0.0), Some(0.0), Some(0.5), Some(0.6)], [Some(0.1); 4]);
+        assert_eq!(noisy.holds, Some(false), "the others must really rise");
     }
 
     #[test]
@@ -227,6 +314,7 @@ mod tests {
             scene: "kitchen".into(),
             test_frames: 3,
             threshold: THRESHOLD,
+            seeds: 1,
             objects: vec![row("A|1", 0.2, 0.5), timed, absent],
             affordances: vec![],
             order: order([Some(0.1), Some(0.2), Some(0.3), Some(0.4)]),

@@ -5,7 +5,7 @@
 //! inner dimension, the right one in rows of *pairs* of neighbours along the inner dimension.
 
 #[cfg(target_arch = "x86_64")]
-use super::amx::{self, Tiles};
+use super::machine::amx::{self, Tiles};
 
 /// Rows of one tile.
 pub const TILE_ROWS: usize = 16;

@@ -4,11 +4,13 @@
 //! they need no `unsafe`. Lanes are always samples, never features: every width gives the same forward result
 //! for every sample.
 
-#[cfg(target_arch = "x86_64")]
-mod amx;
+mod machine;
 pub mod matrix;
 
+pub use machine::prefetch;
+
 use bytemuck::{Pod, Zeroable};
+use half::f16;
 
 /// Samples per tile: three AVX-512 vectors, six AVX2 vectors or twelve NEON vectors.
 ///
@@ -97,6 +99,22 @@ pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
 }
 
+/// Half precision as f32, exactly; branch-free, so that it vectorises without instructions for it.
+#[inline(always)]
+pub fn widen(from: &[f16], to: &mut [f32]) {
+    for (to, from) in to.iter_mut().zip(from) {
+        let bits = u32::from(from.to_bits());
+        let (sign, exponent, magnitude) = ((bits & 0x8000) << 16, bits & 0x7c00, (bits & 0x7fff) << 13);
+        // Exponents are biased by 15 there and by 127 here.
+        let normal = magnitude + (112 << 23);
+        // A subnormal is its mantissa above 2^-14: put there, the leading one is taken off again.
+        let subnormal = (f32::from_bits(magnitude + (113 << 23)) - f32::from_bits(113 << 23)).to_bits();
+        let special = magnitude | 0x7f80_0000;
+        let finite = if exponent == 0 { subnormal } else { normal };
+        *to = f32::from_bits(sign | if exponent == 0x7c00 { special } else { finite });
+    }
+}
+
 /// 1 - e^-x for x ≥ 0 without cancellation for thin samples.
 #[inline(always)]
 pub fn one_minus_exp_neg(x: f32) -> f32 {
@@ -109,6 +127,19 @@ pub fn one_minus_exp_neg(x: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn every_half_widens_as_it_is_defined() {
+        let all: Vec<f16> = (0..=u16::MAX).map(f16::from_bits).collect();
+        let mut wide = vec![0.0; all.len()];
+        widen(&all, &mut wide);
+        for (half, wide) in all.iter().zip(wide) {
+            assert!(
+                wide.to_bits() == half.to_f32().to_bits() || wide.is_nan() && half.is_nan(),
+                "{half:?} → {wide}"
+            );
+        }
+    }
 
     #[test]
     fn exp_is_within_2_ulp() {

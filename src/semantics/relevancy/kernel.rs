@@ -6,7 +6,6 @@
 //! sums across lanes are few beside the products.
 
 use half::f16;
-use half::slice::HalfFloatSliceExt;
 use pulp::{Arch, Simd, WithSimd};
 
 use super::{Points, Queries};
@@ -16,8 +15,10 @@ use crate::simd;
 const TOGETHER: usize = 8;
 /// Points whose products are kept before they become scores.
 const BLOCK: usize = 64;
-/// Products per point are padded to this: one AVX-512 vector.
-const PADDING: usize = 16;
+/// Phrases of a panel, which are multiplied with a point together: one AVX-512 vector.
+const PANEL: usize = 16;
+/// Dimensions between two checks of where a loop ends.
+const UNROLLED: usize = 4;
 
 /// Features from this length on are long; a multiple of the lanes' number is needed as well.
 const LONG: usize = 128;
@@ -25,50 +26,49 @@ const LONG: usize = 128;
 const FEW: usize = 8;
 /// Points that share a phrase's numbers then.
 const PAIR: usize = 2;
+/// Bytes of long features that are asked for before they are needed: the processor's own prediction stops at pages.
+const AHEAD: usize = 4096;
 
 /// Below this share of its summands, a squared length in f32 has lost digits; the point is computed again in f64.
 const CANCELLED: f32 = 0.05;
 /// Below this share, it is rounding in f64 of numbers that were stored as f32: the feature has vanished.
 const VANISHED: f64 = 1e-12;
 
-/// Phrases in the order in which the kernel reads them.
+/// What a point is multiplied with, phrases and the norm's linear part, in the order in which the kernel reads it.
 pub(super) struct Packed {
-    /// `[dim, stride]`: of each dimension, the numbers of all phrases, then that of the norm's linear part.
-    columns: Vec<f32>,
+    /// `[panels, dim, PANEL]`: of each dimension, the numbers of a panel's phrases.
+    panels: Vec<f32>,
     /// `[FEW, dim]`: the same phrase by phrase, if features are long and phrases few; else empty.
     rows: Vec<f32>,
-    /// `[stride]`: what products start from.
+    /// `[panels, PANEL]`: what products start from.
     offsets: Vec<f32>,
     dim: usize,
-    stride: usize,
-    /// Columns that are in use.
+    /// Columns of the panels that are in use; the last one is the norm's.
     used: usize,
 }
 
 impl Packed {
     pub(super) fn new(queries: &Queries) -> Self {
         let dim = queries.norm.linear.len();
-        let used = queries.phrases.len() + 1;
-        let stride = used.next_multiple_of(PADDING);
-        let (mut columns, mut offsets) = (vec![0.0; dim * stride], vec![0.0; stride]);
-        for (n, phrase) in queries.phrases.iter().enumerate() {
-            offsets[n] = phrase.offset;
-            for (k, v) in phrase.direction.iter().enumerate() {
-                columns[k * stride + n] = *v;
+        let twice: Vec<f32> = queries.norm.linear.iter().map(|v| 2.0 * v).collect();
+        let norm = (&twice[..], queries.norm.constant);
+        let columns: Vec<(&[f32], f32)> =
+            queries.phrases.iter().map(|p| (&p.direction[..], p.offset)).chain([norm]).collect();
+        let used = columns.len();
+        let offsets =
+            (0..used.next_multiple_of(PANEL)).map(|n| columns.get(n).map_or(0.0, |c| c.1)).collect();
+        let mut panels = Vec::with_capacity(used.next_multiple_of(PANEL) * dim);
+        for panel in columns.chunks(PANEL) {
+            for k in 0..dim {
+                panels.extend((0..PANEL).map(|n| panel.get(n).map_or(0.0, |c| c.0[k])));
             }
         }
-        for (k, v) in queries.norm.linear.iter().enumerate() {
-            columns[k * stride + used - 1] = 2.0 * v;
-        }
-        offsets[used - 1] = queries.norm.constant;
         let mut rows = Vec::new();
-        if dim >= LONG && dim.is_multiple_of(PADDING) && used <= FEW {
+        if dim >= LONG && dim.is_multiple_of(PANEL) && used <= FEW {
+            columns.iter().for_each(|column| rows.extend_from_slice(column.0));
             rows.resize(FEW * dim, 0.0);
-            for (n, row) in rows.chunks_exact_mut(dim).enumerate() {
-                row.iter_mut().zip(columns.chunks_exact(stride)).for_each(|(r, column)| *r = column[n]);
-            }
         }
-        Self { columns, rows, offsets, dim, stride, used }
+        Self { panels, rows, offsets, dim, used }
     }
 }
 
@@ -84,10 +84,11 @@ pub(super) fn run(
 }
 
 /// Copies points as f32.
+#[inline(always)]
 pub(super) fn widen(points: Points, out: &mut [f32]) {
     match points {
         Points::F32(values) => out.copy_from_slice(values),
-        Points::F16(values) => values.convert_to_f32_slice(out),
+        Points::F16(values) => simd::widen(values, out),
     }
 }
 
@@ -105,9 +106,9 @@ impl WithSimd for Run<'_, '_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Option<usize> {
         let Run { queries, packed, points, scores, coverage } = self;
-        let (dim, stride) = (packed.dim, packed.stride);
+        let dim = packed.dim;
         let mut wide = Vec::new();
-        let mut products = vec![0.0; BLOCK * stride];
+        let mut products = vec![[[0.0; PANEL]; BLOCK]; packed.used.div_ceil(PANEL)];
         let mut squares = [0.0; BLOCK];
         let mut judged = Judged::new(packed);
         let mut first_bad = None;
@@ -124,15 +125,19 @@ impl WithSimd for Run<'_, '_> {
                 }
             };
             if packed.rows.is_empty() {
-                for (n, rows) in rows.chunks_exact(TOGETHER * dim).enumerate() {
-                    let out = &mut products[n * TOGETHER * stride..][..TOGETHER * stride];
-                    multiply(simd, packed, rows, out);
+                let panels = packed.panels.chunks_exact(dim * PANEL).zip(packed.offsets.as_chunks().0);
+                for ((columns, offsets), out) in panels.zip(&mut products) {
+                    let out = out.as_chunks_mut::<TOGETHER>().0.iter_mut();
+                    for (out, rows) in out.zip(rows.chunks_exact(TOGETHER * dim)) {
+                        multiply(simd, columns, offsets, rows, out);
+                    }
                 }
                 for (square, row) in squares.iter_mut().zip(rows.chunks_exact(dim)) {
                     *square = squared(simd, row);
                 }
             } else {
-                let pairs = products.chunks_exact_mut(PAIR * stride).zip(squares.as_chunks_mut::<PAIR>().0);
+                let pairs =
+                    products[0].as_chunks_mut::<PAIR>().0.iter_mut().zip(squares.as_chunks_mut::<PAIR>().0);
                 for ((products, squares), rows) in pairs.zip(rows.chunks_exact(PAIR * dim)) {
                     multiply_long(simd, packed, rows, products, squares);
                 }
@@ -172,6 +177,7 @@ impl WithSimd for Run<'_, '_> {
     }
 }
 
+#[inline(always)]
 fn part_of(points: Points<'_>, start: usize, end: usize) -> Points<'_> {
     match points {
         Points::F32(values) => Points::F32(&values[start..end]),
@@ -179,42 +185,58 @@ fn part_of(points: Points<'_>, start: usize, end: usize) -> Points<'_> {
     }
 }
 
-/// Products of eight points `[8, dim]` with all columns, to `out` `[8, stride]`.
+/// Products of eight points `[8, dim]` with a panel `[dim, PANEL]`.
 #[inline(always)]
-fn multiply<S: Simd>(simd: S, packed: &Packed, rows: &[f32], out: &mut [f32]) {
-    let (dim, stride) = (packed.dim, packed.stride);
-    let vectors = stride / S::F32_LANES;
-    let used = packed.used.div_ceil(S::F32_LANES);
-    let columns = S::as_simd_f32s(&packed.columns).0;
-    let offsets = S::as_simd_f32s(&packed.offsets).0;
-    let out = S::as_mut_simd_f32s(out).0;
-    let [a, b, c, d, e, f, g, h]: [&[f32]; TOGETHER] = std::array::from_fn(|p| &rows[p * dim..(p + 1) * dim]);
-    for v in 0..used {
-        let mut sums = [offsets[v]; TOGETHER];
+fn multiply<S: Simd>(
+    simd: S,
+    panel: &[f32],
+    offsets: &[f32; PANEL],
+    rows: &[f32],
+    out: &mut [[f32; PANEL]; TOGETHER],
+) {
+    let dim = panel.len() / PANEL;
+    let (panel, offsets) = (S::as_simd_f32s(panel).0, S::as_simd_f32s(offsets).0);
+    let vectors = offsets.len();
+    let (panel, panel_rest) = panel.split_at(dim / UNROLLED * UNROLLED * vectors);
+    let rows: [&[f32]; TOGETHER] = std::array::from_fn(|p| &rows[p * dim..(p + 1) * dim]);
+    let rests = rows.map(|row| row.as_chunks::<UNROLLED>().1);
+    let [a, b, c, d, e, f, g, h] = rows.map(|row| row.as_chunks::<UNROLLED>().0);
+    for (v, offset) in offsets.iter().enumerate() {
+        let mut sums = [*offset; TOGETHER];
         // Zipped, since an index into each row would be checked for every number.
         let rows = a.iter().zip(b).zip(c).zip(d).zip(e).zip(f).zip(g).zip(h);
-        for (column, (((((((a, b), c), d), e), f), g), h)) in columns.chunks_exact(vectors).zip(rows) {
-            let (column, values) = (column[v], [a, b, c, d, e, f, g, h]);
+        for (columns, (((((((a, b), c), d), e), f), g), h)) in
+            panel.chunks_exact(UNROLLED * vectors).zip(rows)
+        {
+            let values = [a, b, c, d, e, f, g, h];
+            for k in 0..UNROLLED {
+                let column = columns[k * vectors + v];
+                for p in 0..TOGETHER {
+                    sums[p] = simd.mul_add_e_f32s(simd.splat_f32s(values[p][k]), column, sums[p]);
+                }
+            }
+        }
+        for (k, columns) in panel_rest.chunks_exact(vectors).enumerate() {
             for p in 0..TOGETHER {
-                sums[p] = simd.mul_add_e_f32s(simd.splat_f32s(*values[p]), column, sums[p]);
+                sums[p] = simd.mul_add_e_f32s(simd.splat_f32s(rests[p][k]), columns[v], sums[p]);
             }
         }
         for p in 0..TOGETHER {
-            out[p * vectors + v] = sums[p];
+            S::as_mut_simd_f32s(&mut out[p]).0[v] = sums[p];
         }
     }
 }
 
-/// Products of two long points `[2, dim]` with all rows, to `out` `[2, stride]`, and their |z|².
+/// Products of two long points `[2, dim]` with all rows, and their |z|².
 #[inline(always)]
 fn multiply_long<S: Simd>(
     simd: S,
     packed: &Packed,
     rows: &[f32],
-    out: &mut [f32],
+    out: &mut [[f32; PANEL]; PAIR],
     squares: &mut [f32; PAIR],
 ) {
-    let Packed { dim, stride, used, .. } = *packed;
+    let dim = packed.dim;
     let phrases: [&[S::f32s]; FEW] =
         std::array::from_fn(|n| S::as_simd_f32s(&packed.rows[n * dim..(n + 1) * dim]).0);
     let [x, y] = [0, 1].map(|p| S::as_simd_f32s(&rows[p * dim..(p + 1) * dim]).0);
@@ -225,6 +247,7 @@ fn multiply_long<S: Simd>(
     for ((x, y), (((((((a, b), c), d), e), f), g), h)) in x.iter().zip(y).zip(phrases) {
         let phrases = [a, b, c, d, e, f, g, h];
         for (p, point) in [x, y].into_iter().enumerate() {
+            simd::prefetch(point, AHEAD);
             lengths[p] = simd.mul_add_e_f32s(*point, *point, lengths[p]);
             for n in 0..FEW {
                 sums[p][n] = simd.mul_add_e_f32s(*point, *phrases[n], sums[p][n]);
@@ -233,8 +256,8 @@ fn multiply_long<S: Simd>(
     }
     for p in 0..PAIR {
         squares[p] = simd.reduce_sum_f32s(lengths[p]);
-        for n in 0..used {
-            out[p * stride + n] = packed.offsets[n] + simd.reduce_sum_f32s(sums[p][n]);
+        for n in 0..packed.used {
+            out[p][n] = packed.offsets[n] + simd.reduce_sum_f32s(sums[p][n]);
         }
     }
 }
@@ -278,12 +301,18 @@ impl Judged {
     }
 }
 
-/// Judges the products `[BLOCK, stride]` and squared lengths of a block.
+/// Judges the products and squared lengths of a block.
 #[inline(always)]
-fn judge(queries: &Queries, packed: &Packed, products: &[f32], squares: &[f32; BLOCK], out: &mut Judged) {
-    for (p, products) in products.chunks_exact(packed.stride).enumerate() {
-        for (n, product) in products[..packed.used].iter().enumerate() {
-            out.columns[n * BLOCK + p] = *product;
+fn judge(
+    queries: &Queries,
+    packed: &Packed,
+    products: &[[[f32; PANEL]; BLOCK]],
+    squares: &[f32; BLOCK],
+    out: &mut Judged,
+) {
+    for (n, column) in out.columns.as_chunks_mut::<BLOCK>().0.iter_mut().enumerate() {
+        for (value, products) in column.iter_mut().zip(&products[n / PANEL]) {
+            *value = products[n % PANEL];
         }
     }
     let (phrases, linear) = out.columns.as_chunks::<BLOCK>().0.split_at(packed.used - 1);

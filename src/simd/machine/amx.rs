@@ -1,14 +1,13 @@
-//! The CPU's matrix units (Intel AMX, bf16): the one module of this crate with `unsafe` code.
+//! The CPU's matrix units (Intel AMX, bf16).
 //!
 //! Rust's AMX intrinsics are not stable, so the tile instructions are inline assembly. Everything here is behind the
-//! safe type [`Tiles`]; its twin in plain code is in [`super::matrix`].
-#![allow(unsafe_code)]
+//! safe type [`Tiles`]; its twin in plain code is in [`crate::simd::matrix`].
 
 use std::arch::asm;
 use std::marker::PhantomData;
 use std::sync::OnceLock;
 
-use super::matrix::{Keep, Narrowed, PANEL, Pairs, TILE_ROWS};
+use crate::simd::matrix::{Keep, Narrowed, PANEL, Pairs, TILE_ROWS};
 
 /// Bytes of a tile register's row: 32 bf16, 16 pairs of them or 16 f32.
 const ROW_BYTES: usize = 64;
@@ -79,7 +78,7 @@ impl Tiles {
         Some(Self { thread: PhantomData })
     }
 
-    /// c = A B for 16 rows of A and a panel of 48 columns; see [`super::matrix::Unit::panel`].
+    /// c = A B for 16 rows of A and a panel of 48 columns; see [`crate::simd::matrix::Unit::panel`].
     #[inline(always)]
     pub fn panel(&self, a: &[u16], b: &[Pairs], c: &mut [f32]) {
         let blocks = a.len() / (TILE_ROWS * 32);
@@ -117,7 +116,7 @@ impl Tiles {
         }
     }
 
-    /// c = A B for a block of 32 × 32 and a long inner dimension; see [`super::matrix::Unit::outer`].
+    /// c = A B for a block of 32 × 32 and a long inner dimension; see [`crate::simd::matrix::Unit::outer`].
     #[inline(always)]
     pub fn outer(
         &self,
@@ -169,14 +168,14 @@ impl Tiles {
         }
     }
 
-    /// See [`super::matrix::Unit::narrow`].
+    /// See [`crate::simd::matrix::Unit::narrow`].
     #[inline(always)]
     pub fn narrow(&self, rows: &[f32; 2 * PANEL], bias: [f32; 2], keep: Keep, out: Narrowed) {
         // SAFETY: `available` has checked for these instructions.
         unsafe { narrow(rows, bias, keep, out) }
     }
 
-    /// See [`super::matrix::Unit::transpose`].
+    /// See [`crate::simd::matrix::Unit::transpose`].
     #[inline(always)]
     pub fn transpose(&self, rows: &[Pairs], stride: usize, out: &mut [Pairs; 256]) {
         assert!(rows.len() >= 15 * stride + 16);
