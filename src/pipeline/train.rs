@@ -12,6 +12,7 @@ use super::{Event, Observer, PipelineError};
 use crate::config::Config;
 use crate::error::FileError;
 use crate::scene::Scene;
+use crate::semantics::head::train::check_features;
 use crate::train::{Session, Trainer};
 
 /// Trains `run` on `scene` until the schedule ends or `observer` says stop; in both cases what was trained is stored.
@@ -44,9 +45,11 @@ pub fn train(
             return Ok(Session::Over(Box::new(trained)));
         }
         drop(trained);
+        check_features(scene, &config.semantics)?;
         observer.event(&Event::Resuming { step: progress.step, seconds: progress.seconds });
         Trainer::resume(scene, config, run.root())?
     } else {
+        check_features(scene, &config.semantics)?;
         Trainer::new(scene, config)?
     };
     // Not before the scene has been read: a folder whose scene was broken is not yet a run.

@@ -54,6 +54,14 @@ pub struct Ray {
     pub range: (f32, f32),
 }
 
+impl Ray {
+    /// The point at distance `t`.
+    #[inline]
+    pub fn at(&self, t: f32) -> Vec3 {
+        self.origin + self.dir * t
+    }
+}
+
 impl View {
     /// The pose of a frame with the field's refinement at its time.
     pub fn new(field: &Field, frame: &Frame) -> Self {

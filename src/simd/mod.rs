@@ -115,6 +115,18 @@ pub fn widen(from: &[f16], to: &mut [f32]) {
     }
 }
 
+/// Σ a b of as many numbers as both have, in sixteen sums that vectorise.
+pub fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<16>(), b.as_chunks::<16>());
+    let mut sums = [0.0f32; 16];
+    for (a, b) in a.iter().zip(b) {
+        for k in 0..16 {
+            sums[k] += a[k] * b[k];
+        }
+    }
+    sums.iter().sum::<f32>() + a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum::<f32>()
+}
+
 /// 1 - e^-x for x ≥ 0 without cancellation for thin samples.
 #[inline(always)]
 pub fn one_minus_exp_neg(x: f32) -> f32 {

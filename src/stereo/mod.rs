@@ -8,6 +8,7 @@
 mod aggregate;
 mod consistency;
 mod rig;
+mod see_through;
 mod sweep;
 #[cfg(test)]
 mod tests;
@@ -17,6 +18,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use self::rig::WorkView;
+pub use self::see_through::{SeenFrame, seen_through};
 use crate::config::ConfigError;
 use crate::scene::Camera;
 
@@ -102,14 +104,32 @@ impl StereoDepth {
 
     /// Depth along the camera's axis in the direction `dir` (camera axes); `None` where it is not known.
     pub fn at(&self, dir: Vec3) -> Option<f32> {
+        let depth = self.depth[self.seen(dir)?];
+        (depth > 0.0).then_some(depth)
+    }
+
+    /// Number of the pixel in the direction `dir` (camera axes) as a frame's own lens has it; `None` outside.
+    pub fn seen(&self, dir: Vec3) -> Option<usize> {
+        if dir.z <= 0.0 {
+            return None;
+        }
         let slope = dir.truncate() / dir.z;
         let [focal, radial] = self.lens;
-        let p = slope * (1.0 + focal + radial * slope.length_squared()) * self.focal + self.principal;
-        let inside = dir.z > 0.0
-            && p.cmpge(Vec2::ZERO).all()
-            && p.cmplt(Vec2::new(self.width as f32, self.height as f32)).all();
-        let depth = if inside { self.depth[p.y as usize * self.width + p.x as usize] } else { 0.0 };
-        (depth > 0.0).then_some(depth)
+        self.pixel((slope * (1.0 + focal + radial * slope.length_squared())).extend(1.0))
+    }
+
+    /// Number of the pixel in the direction `dir` (camera axes, z = 1, refined lens); `None` outside.
+    fn pixel(&self, dir: Vec3) -> Option<usize> {
+        let p = dir.truncate() * self.focal + self.principal;
+        let inside =
+            p.cmpge(Vec2::ZERO).all() && p.cmplt(Vec2::new(self.width as f32, self.height as f32)).all();
+        inside.then_some(p.y as usize * self.width + p.x as usize)
+    }
+
+    /// Direction (camera axes, z = 1) of the middle of pixel number `k`.
+    fn ray(&self, k: usize) -> Vec3 {
+        let p = Vec2::new((k % self.width) as f32 + 0.5, (k / self.width) as f32 + 0.5);
+        ((p - self.principal) / self.focal).extend(1.0)
     }
 
     /// From now on directions are given as they are before a field's refinement of the lens

@@ -3,6 +3,7 @@
 use crate::config::ConfigError;
 use crate::error::{BadFile, FileError};
 use crate::scene::SceneError;
+use crate::scene::features::FeatureError;
 
 /// Why training cannot start, continue or be stored.
 #[derive(Debug, thiserror::Error)]
@@ -11,6 +12,9 @@ pub enum TrainError {
     /// A frame cannot be read.
     #[error(transparent)]
     Scene(Box<SceneError>),
+    /// The masks that tell what moves cannot be read.
+    #[error(transparent)]
+    Features(Box<FeatureError>),
     /// A setting cannot be used.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -44,5 +48,11 @@ pub enum TrainError {
 impl From<SceneError> for TrainError {
     fn from(error: SceneError) -> Self {
         Self::Scene(Box::new(error))
+    }
+}
+
+impl From<FeatureError> for TrainError {
+    fn from(error: FeatureError) -> Self {
+        Self::Features(Box::new(error))
     }
 }

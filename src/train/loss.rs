@@ -6,6 +6,7 @@ use self::flatness::Bend;
 use crate::field::stream::StreamSamples;
 use crate::render::composite::{Interval, Weighted};
 use crate::render::forward::Chunk;
+use crate::train::moving::Volume;
 
 pub mod flatness;
 
@@ -25,6 +26,9 @@ pub struct LossConfig {
     pub transient: f32,
     /// Price of a pixel that is explained by the dynamic or the actor stream, in nats: the prior odds against it.
     pub transient_opacity: [f32; 2],
+    /// Price of persistent light where things are that move, though they may be at rest, in nats; dynamic light is free
+    /// there. 0: what moves is not looked for.
+    pub moving: f32,
     /// Distortion (Barron et al. 2022, mip-NeRF 360, eq. 15): pulls a ray's weight together.
     pub distortion: f32,
     /// Softness Σ_k T_k α_k (1 − α_k) of a ray: surfaces are hard, air is empty.
@@ -43,12 +47,21 @@ impl Default for LossConfig {
             beta_min: 0.03,
             transient: 0.01,
             transient_opacity: [8.0, 4.0],
+            moving: 20.0,
             distortion: 0.3,
             entropy: 0.0,
             depth: 4.0,
             flatness: 2.0,
             exposure: 0.1,
         }
+    }
+}
+
+impl LossConfig {
+    /// Price of explaining a pixel by each stream, in nats; `moving` where there are things that move.
+    pub fn prices(&self, moving: bool) -> [f32; 3] {
+        let [dynamic, actor] = self.transient_opacity;
+        if moving { [self.moving, 0.0, actor] } else { [0.0, dynamic, actor] }
     }
 }
 
@@ -91,17 +104,28 @@ pub struct RayTarget {
     pub depth: f32,
 }
 
+/// What the rays of a chunk should come to.
+#[derive(Clone, Copy)]
+pub struct Aims<'a> {
+    /// Ray by ray.
+    pub targets: &'a [RayTarget],
+    /// Rows of three rays.
+    pub bends: &'a [Bend],
+    /// Where things are that move.
+    pub moving: &'a Volume,
+}
+
 /// Evaluates the loss of a traced chunk and fills `grad`. `scale` multiplies the whole gradient (1 / rays).
 #[inline(always)]
 pub fn backward(
     config: &LossConfig,
     chunk: &Chunk,
-    targets: &[RayTarget],
-    bends: &[Bend],
+    aims: &Aims,
     count: usize,
     scale: f32,
     grad: &mut ChunkGradient,
 ) -> ChunkLoss {
+    let Aims { targets, bends, moving } = *aims;
     let total = chunk.intervals.len();
     grad.weight.resize(total, [0.0; 3]);
     grad.sigma.resize(total, [0.0; 3]);
@@ -137,6 +161,7 @@ pub fn backward(
         let exposure = target.exposure.iter().map(|e| e * e).sum::<f32>();
         let mut extra = 0.5 * config.exposure * exposure;
         for k in range.clone() {
+            let prices = config.prices(moving.contains(ray.ray.at(chunk.intervals[k].t)));
             for s in 0..3 {
                 let w = chunk.weighted[k].weight[s];
                 let rgb = chunk.samples[s].rgb[k];
@@ -145,10 +170,9 @@ pub fn backward(
                     g += d_rgb[c] * rgb[c];
                     grad.samples[s].rgb[k][c] = d_rgb[c] * w;
                 }
+                extra += prices[s] * w;
+                g += scale * prices[s];
                 if s > 0 {
-                    let price = config.transient_opacity[s - 1];
-                    extra += price * w;
-                    g += scale * price;
                     g += d_beta * chunk.samples[s].beta[k];
                     grad.samples[s].beta[k] = d_beta * w;
                 }

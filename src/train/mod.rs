@@ -6,6 +6,7 @@ pub mod checkpoint;
 mod config;
 mod error;
 pub mod loss;
+mod moving;
 pub mod pixels;
 mod schedule;
 mod session;

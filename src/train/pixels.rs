@@ -3,11 +3,13 @@
 use glam::DAffine3;
 use rayon::prelude::*;
 
+use super::moving::masks::FrameMasks;
+use super::moving::{self, Evidence, Volume};
 use crate::field::Field;
 use crate::render::rays::{PixelDirections, View, pixel_directions};
 use crate::render::refined::refined_camera;
 use crate::scene::{Camera, Frame, SceneError};
-use crate::stereo::{self, StereoConfig, StereoDepth, StereoFrame};
+use crate::stereo::{self, SeenFrame, StereoConfig, StereoDepth, StereoFrame};
 
 /// Frames with their pixels and the directions of their cameras' pixels.
 pub struct PixelSet {
@@ -17,6 +19,8 @@ pub struct PixelSet {
     pub images: Vec<Vec<[u8; 3]>>,
     /// Depth of the frames where their neighbours tell it; empty before it was looked for.
     pub stereo: Vec<StereoDepth>,
+    /// Where things are that move; nothing before that was looked for.
+    pub moving: Volume,
     /// Indices of usable pixels where a frame has a mask.
     usable: Vec<Option<Vec<u32>>>,
     cameras: Vec<(Camera, PixelDirections)>,
@@ -49,7 +53,7 @@ impl PixelSet {
                 })
             })
             .collect();
-        Ok(Self { frames, images, stereo: Vec::new(), usable, cameras, camera_of })
+        Ok(Self { frames, images, stereo: Vec::new(), moving: Volume::default(), usable, cameras, camera_of })
     }
 
     /// Directions of all pixels of frame `n` in camera axes.
@@ -59,16 +63,7 @@ impl PixelSet {
 
     /// Finds the depth of the frames by stereo, from where the field says that they are; in units.
     pub fn look_at_depth(&mut self, field: &Field, config: &StereoConfig) {
-        let n = field.normalisation;
-        let cameras: Vec<(Camera, DAffine3)> = self
-            .frames
-            .iter()
-            .map(|f| {
-                let (camera, c2w) = refined_camera(field, f);
-                let translation = (c2w.translation - n.origin) / n.scale;
-                (camera, DAffine3 { translation, ..c2w })
-            })
-            .collect();
+        let (n, cameras) = (field.normalisation, self.refined_cameras(field));
         let frames: Vec<StereoFrame> = (cameras.iter().zip(&self.images))
             .map(|((camera, c2w), rgb)| StereoFrame { camera, c2w: *c2w, rgb })
             .collect();
@@ -79,6 +74,42 @@ impl PixelSet {
         }
         let coverage = self.stereo.iter().map(StereoDepth::coverage).sum::<f64>();
         tracing::info!(coverage = coverage / self.frames.len().max(1) as f64, "depth by stereo");
+    }
+
+    /// Looks for things that move where frames of known depth see through what others show, from where the field says that
+    /// they are; with `masks` whole things, else what is clear by itself.
+    pub fn look_for_movement(&mut self, field: &Field, masks: Option<&FrameMasks>) {
+        let cameras = self.refined_cameras(field);
+        let seen: Vec<SeenFrame> = (cameras.iter().zip(&self.stereo).zip(&self.frames))
+            .map(|(((_, c2w), depth), frame)| SeenFrame { c2w: *c2w, depth, time: frame.time })
+            .collect();
+        let of = masks.map_or_else(|| (0..seen.len()).collect(), FrameMasks::frames);
+        let through = stereo::seen_through(&seen, &of);
+        let evidence: Vec<Evidence> = (of.iter().zip(through))
+            .map(|(n, seen_through)| Evidence {
+                frame: &self.frames[*n],
+                c2w: cameras[*n].1,
+                directions: self.directions(*n),
+                depth: &self.stereo[*n],
+                seen_through,
+            })
+            .collect();
+        let extent = field.normalisation.extent;
+        self.moving = match masks {
+            Some(masks) => moving::masks::volume(extent, masks, &evidence),
+            None => Volume::of_depths(extent, &evidence),
+        };
+    }
+
+    /// The cameras of all frames, and where they are (camera to world, units from the box's corner).
+    pub(super) fn refined_cameras(&self, field: &Field) -> Vec<(Camera, DAffine3)> {
+        let n = field.normalisation;
+        let refined = |frame: &Frame| {
+            let (camera, c2w) = refined_camera(field, frame);
+            let translation = (c2w.translation - n.origin) / n.scale;
+            (camera, DAffine3 { translation, ..c2w })
+        };
+        self.frames.iter().map(refined).collect()
     }
 
     /// Distance along the ray of a pixel of frame `n` at which it ends according to stereo, in the unit of the

@@ -10,13 +10,15 @@ use super::align;
 use super::checkpoint::{Trained, TrainingState};
 use super::config::StreamChoice;
 use super::error::TrainError;
+use super::moving::masks::FrameMasks;
 use super::pixels::PixelSet;
 use super::step::{Companion, Optimiser, StepReport};
 use crate::config::Config;
-use crate::field::{Field, FieldShape, Normalisation};
+use crate::field::{Field, FieldShape, Normalisation, Stream};
 use crate::render::forward::{Grids, Model};
 use crate::render::image::render;
 use crate::render::sampler::Sampling;
+use crate::scene::features::FeatureStore;
 use crate::scene::{Frame, Scene, Split};
 
 #[cfg(test)]
@@ -92,6 +94,8 @@ pub struct Trainer {
     optimiser: Optimiser,
     pixels: PixelSet,
     test: PixelSet,
+    /// Until they have told what moves.
+    masks: Option<FrameMasks>,
     streams: [bool; 3],
 }
 
@@ -103,6 +107,7 @@ impl Trainer {
     pub fn new(scene: &Scene, config: &Config) -> Result<Self, TrainError> {
         config.validate()?;
         let (pixels, test) = load(scene)?;
+        let masks = load_masks(scene, config, &pixels)?;
         let all = config.train.streams != StreamChoice::Static;
         let shape = FieldShape {
             config: config.field.clone(),
@@ -116,7 +121,15 @@ impl Trainer {
         let grids = Grids::new(&field, config.train.grid_cells);
         let optimiser = Optimiser::new(&field);
         let trained = Trained { field, grids, progress: TrainingState::default() };
-        Ok(Self { config: config.clone(), streams: [true, false, false], trained, optimiser, pixels, test })
+        Ok(Self {
+            config: config.clone(),
+            streams: [true, false, false],
+            trained,
+            optimiser,
+            pixels,
+            test,
+            masks,
+        })
     }
 
     /// A trainer that goes on where the checkpoint in `run` ends.
@@ -127,11 +140,12 @@ impl Trainer {
         config.validate()?;
         let (trained, optimiser) = Trained::resume(run)?;
         let (pixels, test) = load(scene)?;
+        let masks = load_masks(scene, config, &pixels)?;
         let streams = match trained.progress.streams_settled {
             true => trained.field.shape.streams,
             false => [true, false, false],
         };
-        Ok(Self { config: config.clone(), trained, optimiser, pixels, test, streams })
+        Ok(Self { config: config.clone(), trained, optimiser, pixels, test, masks, streams })
     }
 
     /// Trains to the end of the schedule, or until `budget` is used up (the schedule then follows the clock), or
@@ -284,6 +298,9 @@ impl Trainer {
         let then = progress.stereo_from.get_or_insert_with(|| now.clone());
         field.weights[refinement.clone()].copy_from_slice(then);
         self.pixels.look_at_depth(field, &self.config.stereo);
+        if field.shape.streams[Stream::Dynamic as usize] && self.config.loss.moving > 0.0 {
+            self.pixels.look_for_movement(field, self.masks.take().as_ref());
+        }
         field.weights[refinement].copy_from_slice(&now);
     }
 
@@ -372,6 +389,18 @@ fn load(scene: &Scene) -> Result<(PixelSet, PixelSet), TrainError> {
         return Err(TrainError::NoPixels);
     }
     Ok((pixels, PixelSet::load(of(Split::Test))?))
+}
+
+/// The masks that tell what moves, where that is asked.
+fn load_masks(scene: &Scene, config: &Config, pixels: &PixelSet) -> Result<Option<FrameMasks>, TrainError> {
+    let asked = config.train.streams != StreamChoice::Static
+        && config.train.stereo_at < 1.0
+        && config.loss.moving > 0.0;
+    if !asked {
+        return Ok(None);
+    }
+    let masks = FrameMasks::load(&FeatureStore::open(scene)?, &pixels.frames)?;
+    Ok((!masks.frames().is_empty()).then_some(masks))
 }
 
 fn psnr(mean_squared: f64) -> f64 {

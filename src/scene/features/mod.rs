@@ -207,6 +207,14 @@ pub struct Masks {
 impl Masks {
     /// What the index map says where there is no mask.
     pub const NONE: u16 = u16::MAX;
+
+    /// Numbers of the masks that a point of an image of `image_px` is in, one a level at most.
+    pub fn at(&self, [x, y]: [f64; 2], image_px: [f64; 2]) -> impl Iterator<Item = usize> + '_ {
+        let (col, row) = (cell(x, image_px[0], self.width), cell(y, image_px[1], self.height));
+        let plane = self.width * self.height;
+        let levels = (0..self.levels).map(move |l| self.index[l * plane + row * self.width + col]);
+        levels.filter(|i| *i != Self::NONE).map(usize::from)
+    }
 }
 
 /// Where the hands and what they handle are in a frame.

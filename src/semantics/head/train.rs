@@ -99,6 +99,18 @@ impl Targets {
 /// Whether to go on is asked after every report.
 type Report<'a> = dyn FnMut(&HeadProgress) -> ControlFlow<()> + 'a;
 
+/// Reads all features that training would read, so that what is wrong with them shows before geometry is trained.
+///
+/// # Errors
+/// [`SemanticsError`] for features that cannot be used.
+pub fn check_features(scene: &Scene, config: &SemanticsConfig) -> Result<(), SemanticsError> {
+    if config.enabled {
+        let frames: Vec<Frame> = scene.frames.iter().filter(|f| f.split == Split::Train).cloned().collect();
+        Targets::load(scene, &frames, config)?;
+    }
+    Ok(())
+}
+
 /// Trains the fields of all spaces that the scene has features of; what is absent is told in
 /// [`SemanticFields::skipped`]. Geometry is trained with them in the end, where settings want it; `run` is where its
 /// checkpoint is. Nothing is stored.

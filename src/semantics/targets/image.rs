@@ -7,8 +7,7 @@ use super::table::TargetTable;
 use super::{centre, gathered};
 use crate::scene::Frame;
 use crate::scene::features::{
-    Blend, Descriptors, FeatureError, FeatureStore, FrameFeatures, Interpolation, Masks, PatchGrid, cell,
-    normalise,
+    Blend, Descriptors, FeatureError, FeatureStore, FrameFeatures, Interpolation, Masks, PatchGrid, normalise,
 };
 
 /// What a pixel's image-language feature is learned from: the paper's ablations.
@@ -165,12 +164,8 @@ impl ImageTargets {
     }
 
     fn mask_at(&self, first: u32, masks: &Masks, frame: usize, x: u32, y: u32) -> Option<Blend> {
-        let ([px, py], [width, height]) = (centre(x, y), self.image_px[frame]);
-        let (col, row) = (cell(px, width, masks.width), cell(py, height, masks.height));
-        let plane = masks.width * masks.height;
-        let levels = (0..masks.levels).map(|l| masks.index[l * plane + row * masks.width + col]);
-        let usable = levels.filter(|i| *i != Masks::NONE && masks.masks.is_usable(usize::from(*i)));
-        Blend::new(usable.map(|i| (first + u32::from(i), 1.0)))
+        let usable = masks.at(centre(x, y), self.image_px[frame]).filter(|i| masks.masks.is_usable(*i));
+        Blend::new(usable.map(|i| (first + i as u32, 1.0)))
     }
 
     fn patch_at(&self, (first, grid): &(u32, PatchGrid), frame: usize, x: u32, y: u32) -> Option<Blend> {

@@ -13,6 +13,7 @@ use crate::rng::Rng;
 use crate::simd::TILE;
 use crate::stereo::StereoDepth;
 use crate::train::loss::ChunkGradient;
+use crate::train::moving::{Evidence, Volume};
 use crate::train::testing;
 
 /// Relative tolerance: f32 sums of a few hundred terms, with room for cancellation in them.
@@ -97,6 +98,16 @@ fn trace_with(seed: u64, precision: Precision, config: LossConfig) -> Traced {
     shake(layout.rig.clone(), 0.01);
     // In the middle of the box, so that rays end in front of it, within its error and behind it.
     pixels.stereo = pixels.frames.iter().map(|f| StereoDepth::flat(&f.camera, 0.3)).collect();
+    // In that plane every other column shows something that moves.
+    let cameras = pixels.refined_cameras(&field);
+    let evidence = pixels.frames.iter().enumerate().map(|(n, frame)| Evidence {
+        frame,
+        c2w: cameras[n].1,
+        directions: pixels.directions(n),
+        depth: &pixels.stereo[n],
+        seen_through: (0..pixels.stereo[n].depth.len() as i32).map(|k| 20 * (k % 2)).collect(),
+    });
+    pixels.moving = Volume::of_depths(field.normalisation.extent, &evidence.collect::<Vec<_>>());
     let mut grids = Grids::new(&field, settings.train.grid_cells);
     for sigma in grids.streams.iter_mut().flat_map(|g| &mut g.sigma) {
         *sigma = if rng.uniform() < 0.2 { 0.0 } else { 0.1 + 4.0 * rng.uniform() };
@@ -178,6 +189,7 @@ impl Traced {
             inputs: &self.chunk.inputs,
             targets: &self.chunk.targets,
             bends: &self.chunk.bends,
+            moving: &self.pixels.moving,
             config: &self.config,
             count: self.plan.sampling.count,
         })

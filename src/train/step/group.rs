@@ -11,7 +11,7 @@ use crate::render::rays::View;
 use crate::rng::Rng;
 use crate::simd::TILE;
 use crate::train::loss::flatness::{self, Bend};
-use crate::train::loss::{self, ChunkGradient, ChunkLoss, LossConfig, RayTarget};
+use crate::train::loss::{self, Aims, ChunkGradient, ChunkLoss, LossConfig, RayTarget};
 use crate::train::pixels::PixelSet;
 
 /// Random cells of each density grid that a group looks at in a step.
@@ -223,7 +223,8 @@ impl TrainChunk {
             companion.ask(number, &self.traced, &mut gradient.asked);
         }
         let scale = 1.0 / context.rays as f32;
-        loss::backward(context.config, &self.traced, &self.targets, &self.bends, count, scale, gradient)
+        let aims = Aims { targets: &self.targets, bends: &self.bends, moving: &context.pixels.moving };
+        loss::backward(context.config, &self.traced, &aims, count, scale, gradient)
     }
 
     /// Adds the gradients of all dense weights to `dense`, and leaves those of the encodings in the batches.

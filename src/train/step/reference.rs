@@ -15,6 +15,7 @@ use crate::render::forward::{Chunk, RayInput};
 use crate::render::rays::View;
 use crate::train::loss::flatness::{self, Bend};
 use crate::train::loss::{FAR_OFF, LossConfig, RayTarget, STEREO_ERROR};
+use crate::train::moving::Volume;
 
 /// Everything that is learned, in f64.
 #[derive(Clone)]
@@ -45,6 +46,7 @@ pub struct Reference<'a> {
     pub inputs: &'a [RayInput],
     pub targets: &'a [RayTarget],
     pub bends: &'a [Bend],
+    pub moving: &'a Volume,
     pub config: &'a LossConfig,
     pub count: usize,
 }
@@ -96,6 +98,7 @@ impl Reference<'_> {
         for (i, sample) in intervals.iter().zip(samples) {
             let delta = f64::from(i.delta);
             let sum: f64 = sample.iter().map(|s| s.sigma).sum();
+            let prices = c.prices(self.moving.contains(self.chunk.rays[r].ray.at(i.t)));
             let alpha = 1.0 - (-sum * delta).exp();
             let mut total = 0.0;
             for (s, sample) in sample.iter().enumerate() {
@@ -107,8 +110,8 @@ impl Reference<'_> {
                 if s > 0 {
                     beta += w * sample.beta;
                     transient += sample.sigma * delta;
-                    price += f64::from(c.transient_opacity[s - 1]) * w;
                 }
+                price += f64::from(prices[s]) * w;
             }
             let (t, depth) = (f64::from(i.t), f64::from(self.targets[r].depth));
             if depth > 0.0 {
