@@ -7,6 +7,8 @@
 
 mod aggregate;
 mod consistency;
+mod fill;
+mod plane;
 mod rig;
 mod see_through;
 mod sweep;
@@ -18,6 +20,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use self::rig::WorkView;
+pub use self::plane::{Plane, Point};
 pub use self::see_through::{SeenFrame, seen_through};
 use crate::config::ConfigError;
 use crate::scene::Camera;
@@ -145,30 +148,67 @@ impl StereoDepth {
     }
 }
 
-/// Depth of every frame, up to `farthest`; all zero for a frame that shares no view with another.
+/// Depth of every frame, up to `farthest`, continued over even surfaces; all zero for a frame that shares no view with
+/// another.
 ///
 /// Deterministic, whatever the number of threads.
 pub fn depths(frames: &[StereoFrame], farthest: f32, config: &StereoConfig) -> Vec<StereoDepth> {
-    let views: Vec<WorkView> = frames.par_iter().map(|f| WorkView::new(f, config.size)).collect();
-    let planes = sweep::Planes::new(config.nearest * farthest, farthest, config.depths);
-    let neighbours: Vec<Vec<usize>> =
-        (0..views.len()).into_par_iter().map(|n| rig::neighbours(&views, n, &planes, config)).collect();
-    let raw: Vec<Vec<f32>> = (0..views.len())
-        .into_par_iter()
-        .map(|n| sweep::inverse_depth(&views, n, &neighbours[n], &planes))
-        .collect();
-    (0..views.len())
-        .into_par_iter()
-        .map(|n| {
-            let v = &views[n];
-            StereoDepth {
-                width: v.width,
-                height: v.height,
-                focal: v.focal,
-                principal: v.principal,
-                lens: [0.0; 2],
-                depth: consistency::keep_agreeing(&views, &raw, n, &neighbours[n], config),
-            }
-        })
-        .collect()
+    let rig = Rig::new(frames, farthest, config);
+    let all: Vec<usize> = (0..frames.len()).collect();
+    let known = rig.matched(&all);
+    let views = &rig.views;
+    let continued: Vec<Vec<f32>> =
+        all.par_iter().map(|n| fill::continued(&views[*n], *n, &known[*n])).collect();
+    all.par_iter().map(|n| rig.depth(*n, fill::checked(views, &known, &continued, *n))).collect()
+}
+
+/// Share of the pixels of the frames `of` whose depth is found by matching alone.
+pub fn coverage(frames: &[StereoFrame], of: &[usize], farthest: f32, config: &StereoConfig) -> f64 {
+    let depths = Rig::new(frames, farthest, config).matched(of);
+    let known = depths.iter().flatten().filter(|d| **d > 0.0).count();
+    known as f64 / depths.iter().map(Vec::len).sum::<usize>().max(1) as f64
+}
+
+/// All frames as they are compared.
+struct Rig<'a> {
+    views: Vec<WorkView>,
+    planes: sweep::Planes,
+    config: &'a StereoConfig,
+}
+
+impl<'a> Rig<'a> {
+    fn new(frames: &[StereoFrame], farthest: f32, config: &'a StereoConfig) -> Self {
+        Self {
+            views: frames.par_iter().map(|f| WorkView::new(f, config.size)).collect(),
+            planes: sweep::Planes::new(config.nearest * farthest, farthest, config.depths),
+            config,
+        }
+    }
+
+    /// Depth of the frames `of` where enough of their neighbours agree; 0 elsewhere.
+    fn matched(&self, of: &[usize]) -> Vec<Vec<f32>> {
+        let Self { views, planes, config } = self;
+        let neighbours = |n: &usize| rig::neighbours(views, *n, planes, config);
+        let asked: Vec<Vec<usize>> = of.par_iter().map(neighbours).collect();
+        let mut needed = vec![false; views.len()];
+        of.iter().chain(asked.iter().flatten()).for_each(|n| needed[*n] = true);
+        let raw: Vec<Vec<f32>> = (0..views.len())
+            .into_par_iter()
+            .map(|n| match needed[n] {
+                true => sweep::inverse_depth(views, n, &neighbours(&n), planes),
+                false => Vec::new(),
+            })
+            .collect();
+        let agreed = |(n, neighbours): (&usize, &Vec<usize>)| {
+            let mut depth = consistency::keep_agreeing(views, &raw, *n, neighbours, config);
+            consistency::drop_edges(&raw[*n], views[*n].width, &mut depth);
+            depth
+        };
+        of.par_iter().zip(&asked).map(agreed).collect()
+    }
+
+    fn depth(&self, n: usize, depth: Vec<f32>) -> StereoDepth {
+        let WorkView { width, height, focal, principal, .. } = self.views[n];
+        StereoDepth { width, height, focal, principal, lens: [0.0; 2], depth }
+    }
 }

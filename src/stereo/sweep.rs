@@ -6,7 +6,7 @@ use super::aggregate::{self, CostVolume, WORST};
 use super::rig::WorkView;
 
 /// Half the side of the window that is compared, px.
-const RADIUS: usize = 2;
+pub(super) const RADIUS: usize = 2;
 
 /// Most frames that one frame is compared with.
 pub(super) const MOST_NEIGHBOURS: usize = 16;

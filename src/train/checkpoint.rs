@@ -50,6 +50,12 @@ pub struct TrainingState {
     pub streams_settled: bool,
     /// Share of image blocks that the persistent stream alone could not explain; `None` before it was measured.
     pub unexplained: Option<f64>,
+    /// Whether the poses as they were given are as good as they can be, so that they are not refined.
+    #[serde(default)]
+    pub trusts_poses: bool,
+    /// Share of pixels whose depth stereo found from the given poses, in a few frames; `None` before that was asked.
+    #[serde(default)]
+    pub given_coverage: Option<f64>,
     /// Pose refinement and rig from which depth was looked for by stereo; `None` before it was.
     pub stereo_from: Option<Vec<f32>>,
     /// How many of the due alignments of the frames are done.

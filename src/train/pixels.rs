@@ -63,17 +63,27 @@ impl PixelSet {
 
     /// Finds the depth of the frames by stereo, from where the field says that they are; in units.
     pub fn look_at_depth(&mut self, field: &Field, config: &StereoConfig) {
-        let (n, cameras) = (field.normalisation, self.refined_cameras(field));
-        let frames: Vec<StereoFrame> = (cameras.iter().zip(&self.images))
-            .map(|((camera, c2w), rgb)| StereoFrame { camera, c2w: *c2w, rgb })
-            .collect();
-        self.stereo = stereo::depths(&frames, n.extent.length(), config);
+        let cameras = self.refined_cameras(field);
+        let farthest = field.normalisation.extent.length();
+        self.stereo = stereo::depths(&self.stereo_frames(&cameras), farthest, config);
         for (depth, frame) in self.stereo.iter_mut().zip(&self.frames) {
             // Asked by the directions that the scene's own intrinsics give.
             depth.refine(View::new(field, frame).lens);
         }
         let coverage = self.stereo.iter().map(StereoDepth::coverage).sum::<f64>();
         tracing::info!(coverage = coverage / self.frames.len().max(1) as f64, "depth by stereo");
+    }
+
+    /// Share of the pixels of the frames `of` that stereo matches from where the field says that the frames are.
+    pub fn stereo_coverage(&self, field: &Field, of: &[usize], config: &StereoConfig) -> f64 {
+        let cameras = self.refined_cameras(field);
+        let farthest = field.normalisation.extent.length();
+        stereo::coverage(&self.stereo_frames(&cameras), of, farthest, config)
+    }
+
+    fn stereo_frames<'a>(&'a self, cameras: &'a [(Camera, DAffine3)]) -> Vec<StereoFrame<'a>> {
+        let frames = cameras.iter().zip(&self.images);
+        frames.map(|((camera, c2w), rgb)| StereoFrame { camera, c2w: *c2w, rgb }).collect()
     }
 
     /// Looks for things that move where frames of known depth see through what others show, from where the field says that

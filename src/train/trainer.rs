@@ -52,6 +52,12 @@ const SETTLE_AFTER: u64 = 500;
 /// Share of such blocks above which something moves.
 const MOVING_SHARE: f64 = 0.03;
 
+/// Frames by which poses are judged.
+const JUDGED_FRAMES: usize = 12;
+
+/// Share of their pixels of which stereo finds the depth, from where poses need no refinement.
+const WELL_POSED: f64 = 0.3;
+
 /// What the caller hears while training goes on; a line of a run's `log.jsonl`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
@@ -163,17 +169,21 @@ impl Trainer {
         let start = Instant::now();
         let mut saved = Instant::now();
         let mut window = Window::new();
+        if self.trained.progress.step == 0 {
+            self.judge_poses();
+        }
         while !self.trained.progress.finished {
             let fraction = self.fraction(budget);
             if !self.trained.progress.streams_settled && self.stands(fraction) {
                 self.settle_streams();
             }
-            if fraction >= self.config.train.stereo_at {
+            if fraction >= self.config.train.stereo_at || self.trained.progress.stereo_from.is_some() {
                 self.look_at_depth();
             }
             let due = self.config.train.align_at.iter().filter(|at| fraction >= **at).count();
             if due > self.trained.progress.aligned
                 && self.trained.progress.step >= self.config.train.align_after
+                && !self.trained.progress.trusts_poses
             {
                 self.align();
                 self.trained.progress.aligned = due;
@@ -263,7 +273,10 @@ impl Trainer {
     ) -> Result<StepReport, TrainError> {
         let Trained { field, grids, progress } = &mut self.trained;
         progress.step += 1;
-        let plan = self.config.train.plan(progress.step, fraction, self.streams);
+        let mut plan = self.config.train.plan(progress.step, fraction, self.streams);
+        if progress.trusts_poses {
+            (plan.pose_rate, plan.rig_rate) = (0.0, 0.0);
+        }
         let Config { loss, seed, .. } = &self.config;
         let report = self.optimiser.step(field, grids, &self.pixels, loss, &plan, *seed, companion);
         let non_finite = |stage, index| TrainError::NonFinite { stage, step: progress.step, index };
@@ -286,11 +299,39 @@ impl Trainer {
         tracing::info!(a.frames, a.rotation, a.translation, lens = ?a.lens, "frames aligned");
     }
 
-    /// Finds the depth of the training frames by stereo, unless that is done or not wanted: from where they are by now,
-    /// or from where they were when a training that goes on did so.
+    /// Asks stereo, before the first step, whether the poses as given are good enough to find depth from; then they are
+    /// not refined, and that depth is there from the start.
+    ///
+    /// Refinement follows a field that is not sharp yet. It mends poses that jitter by pixels, and makes exact ones worse.
+    fn judge_poses(&mut self) {
+        let Config { train, stereo, .. } = &self.config;
+        if train.stereo_at >= 1.0 {
+            return;
+        }
+        let refined = !train.align_at.is_empty() || train.pose_rate > 0.0 || train.rig_rate > 0.0;
+        let judged = self.judged_frames();
+        let Trained { field, progress, .. } = &mut self.trained;
+        progress.given_coverage = refined.then(|| self.pixels.stereo_coverage(field, &judged, stereo));
+        progress.trusts_poses = progress.given_coverage.is_none_or(|share| share >= WELL_POSED);
+        if progress.trusts_poses {
+            self.look_at_depth();
+        }
+    }
+
+    /// A few training frames, evenly over the video.
+    fn judged_frames(&self) -> Vec<usize> {
+        let frames = self.pixels.frames.len();
+        (0..frames).step_by(frames.div_ceil(JUDGED_FRAMES).max(1)).collect()
+    }
+
+    /// Finds the depth of the training frames by stereo, unless that is done or not wanted: from where they are by now
+    /// or from where they were given, whichever finds more; or from where they were when a training that goes on did so.
     fn look_at_depth(&mut self) {
         if !self.pixels.stereo.is_empty() || self.config.train.stereo_at >= 1.0 {
             return;
+        }
+        if self.trained.progress.stereo_from.is_none() {
+            self.settle_poses();
         }
         let Trained { field, progress, .. } = &mut self.trained;
         let refinement = field.layout.pose.start..field.layout.rig.end;
@@ -302,6 +343,23 @@ impl Trainer {
             self.pixels.look_for_movement(field, self.masks.take().as_ref());
         }
         field.weights[refinement].copy_from_slice(&now);
+    }
+
+    /// Undoes the refinement of the poses if stereo finds less from them than from the poses as they were given.
+    fn settle_poses(&mut self) {
+        let Some(given) = self.trained.progress.given_coverage else { return };
+        if self.trained.progress.trusts_poses {
+            return;
+        }
+        let judged = self.judged_frames();
+        let Trained { field, progress, .. } = &mut self.trained;
+        let refined = self.pixels.stereo_coverage(field, &judged, &self.config.stereo);
+        if refined < given {
+            let refinement = field.layout.pose.start..field.layout.rig.end;
+            field.weights[refinement].fill(0.0);
+            progress.trusts_poses = true;
+        }
+        tracing::info!(given, refined, "depth by stereo from poses as given and as refined");
     }
 
     /// Whether the persistent stream has had its time alone. A short training gives it more than its share, up to double

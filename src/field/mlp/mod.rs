@@ -17,6 +17,13 @@ use crate::simd::{AlignedVec, TILE};
 /// Widths are multiples of this.
 const BLOCK: usize = 4;
 
+/// Smaller gradients of an output count as none.
+///
+/// Light that is all but stopped leaves gradients down to the smallest denormal number, and CPUs take a hundred times
+/// longer for a product with one. This is a thousandth of Adam's ε and its square is still a normal number, after any
+/// network's weights have made it smaller.
+const LEAST_GRADIENT: f32 = 1e-18;
+
 /// What the networks are multiplied in. Weights, sums, gradients and everything else are f32 in any case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -150,6 +157,9 @@ impl Mlp {
     #[inline(always)]
     pub fn backward<S: Simd>(&self, simd: S, unit: &Unit, packed: &Packed, a: &mut Activations, n: usize) {
         let grad = &mut a.grads[n * a.stride..][..a.end];
+        for g in &mut grad[a.end - a.output..] {
+            *g = if g.abs() < LEAST_GRADIENT { 0.0 } else { *g };
+        }
         match packed {
             Packed::Vector(packed) => {
                 packed.backward(simd, &self.layers, &a.values[n * a.stride..][..a.end], grad);

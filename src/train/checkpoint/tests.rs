@@ -31,6 +31,8 @@ fn random(seed: u64) -> (Trained, Optimiser) {
         unexplained: Some(0.125),
         aligned: 2,
         joint: 0,
+        trusts_poses: true,
+        given_coverage: Some(0.25),
         stereo_from: Some(vec![1.5e-3, -0.1, 0.0]),
     };
     let mut trained = Trained { field, grids, progress };

@@ -1,12 +1,13 @@
 //! Masks complete what is seen through to things, and find the same things elsewhere.
 
-use glam::{DMat3, DVec3, Vec3};
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::{Evidence, Opinion, THICKNESS, Volume};
 use crate::scene::Frame;
 use crate::scene::features::{FeatureError, FeatureStore, Masks, normalise};
 use crate::simd;
+use crate::stereo::Plane;
 
 /// Evidence from which a surface is seen through: more than a mask's edge collects from false matches.
 const EVIDENCE: i32 = 6;
@@ -20,12 +21,6 @@ const SAME: f32 = 0.6;
 
 /// Masks that all are compared with, at most.
 const COMPARED: usize = 2048;
-
-/// How far a thing's surface may be from the plane through it, as a share of its depth.
-const PLANE_ERROR: f64 = 0.08;
-
-/// Times a plane is fitted, each time to what is nearer to the one before.
-const FITS: u32 = 3;
 
 /// Masks with fewer pixels of known depth tell neither what moves nor where they are.
 const LEAST_KNOWN: u32 = 8;
@@ -132,53 +127,6 @@ fn opinion(volume: &Volume, masks: &Masks, evidence: &Evidence, moves: &[bool]) 
     opinion
 }
 
-/// Inverse depths that are affine in the pixel.
-struct Plane {
-    coefficients: DVec3,
-    range: [f64; 2],
-}
-
-impl Plane {
-    /// A least-squares fit that leaves out what does not fit it; `None` with too few points, or all on a line.
-    fn through(points: &[(DVec3, f64)]) -> Option<Self> {
-        // A mask's edge shows what is behind it: the median is not moved by that.
-        let mut inverse: Vec<f64> = points.iter().map(|p| p.1).collect();
-        inverse.sort_by(f64::total_cmp);
-        let median = *inverse.get(inverse.len() / 2)?;
-        let flat = Self { coefficients: DVec3::Z * median, range: [0.0, f64::INFINITY] };
-        (0..FITS).try_fold(flat, |plane, round| {
-            let bound = PLANE_ERROR * f64::from(FITS - round);
-            let fitting: Vec<_> =
-                points.iter().filter(|(p, i)| (plane.at(*p) / i - 1.0).abs() < bound).copied().collect();
-            Self::fit(&fitting)
-        })
-    }
-
-    fn fit(points: &[(DVec3, f64)]) -> Option<Self> {
-        if points.len() < LEAST_KNOWN as usize {
-            return None;
-        }
-        let (mut matrix, mut right) = (DMat3::ZERO, DVec3::ZERO);
-        let mut range = [f64::INFINITY, 0.0f64];
-        for (p, inverse) in points {
-            matrix += DMat3::from_cols(*p * p.x, *p * p.y, *p * p.z);
-            right += *p * *inverse;
-            range = [range[0].min(*inverse), range[1].max(*inverse)];
-        }
-        let sound = matrix.determinant().abs() > 1e-12 * (points.len() as f64).powi(3);
-        sound.then(|| Self { coefficients: matrix.inverse() * right, range })
-    }
-
-    fn at(&self, p: DVec3) -> f64 {
-        self.coefficients.dot(p).clamp(self.range[0], self.range[1])
-    }
-
-    /// Whether an inverse depth is the surface's where the plane has `expected`.
-    fn fits(&self, expected: f64, found: f64) -> bool {
-        (found / expected - 1.0).abs() < PLANE_ERROR
-    }
-}
-
 /// Which masks show things that move: those of which enough is seen through, all masks of the same thing taken together.
 fn judge(tallies: &[&Tally]) -> Vec<bool> {
     let dim = tallies.first().map_or(0, |t| t.descriptor.len());
@@ -250,25 +198,6 @@ mod tests {
         ];
         assert_eq!(judge(&tallies.each_ref()), [true, true, false, false, false, true, true]);
         assert_eq!(judge(&[]), [false; 0]);
-    }
-
-    #[test]
-    fn a_plane_is_found_and_stays_within_what_is_known() {
-        let at = |x: f64, y: f64| DVec3::new(x, y, 1.0);
-        let inverse = |p: DVec3| 0.5 + 0.2 * p.x - 0.1 * p.y;
-        let points: Vec<_> = (0..12)
-            .map(|n| at(0.1 * f64::from(n % 4), 0.1 * f64::from(n / 4)))
-            .map(|p| (p, inverse(p)))
-            .collect();
-        let plane = Plane::through(&points).expect("twelve points span a plane");
-        assert!((plane.at(at(0.15, 0.05)) - inverse(at(0.15, 0.05))).abs() < 1e-12);
-        assert!((plane.at(at(9.0, 0.0)) - 0.56).abs() < 1e-12, "no farther than the farthest that is known");
-        let mut behind = points.clone();
-        behind.extend([(at(0.0, 0.4), 0.2), (at(0.1, 0.4), 0.2), (at(0.3, 0.4), 0.1)]);
-        let robust = Plane::through(&behind).expect("most points are on a plane");
-        assert!((robust.at(at(0.15, 0.05)) - inverse(at(0.15, 0.05))).abs() < 1e-9);
-        assert!(Plane::through(&points[..7]).is_none());
-        assert!(Plane::through(&vec![(at(0.1, 0.1), 0.5); 20]).is_none());
     }
 
     #[test]
