@@ -5,6 +5,7 @@
 //! ```
 #![deny(unsafe_code)]
 
+pub mod bench;
 mod bvh;
 pub mod config;
 pub mod error;

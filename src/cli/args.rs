@@ -5,6 +5,7 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use divff::bench::Kind;
 use divff::map::Times;
 
 /// Semantic 3D maps from egocentric video, on a plain CPU.
@@ -51,6 +52,13 @@ pub enum Command {
     /// Measure a run against its scene's test frames and ground truth
     #[command(after_help = "Example:\n  divff eval runs/kitchen")]
     Eval(EvalArgs),
+    /// Weigh run time against error: what each setting costs and gives on a scene with ground truth
+    #[command(
+        after_help = "Open index.html in the folder. Stopped and given again, it goes on from what was trained.\n\
+        DIVFF_PYTHON names a Python whose packages (scikit-image, open3d, plyfile, trimesh) are timed beside ours.\n\n\
+        Example:\n  divff bench --quick --out bench\n  divff bench kitchen --out bench --sweeps training,voxel"
+    )]
+    Bench(BenchArgs),
     /// Say what a scene, a run, a map or a single file holds, and what is wrong with it
     #[command(after_help = "Example:\n  divff inspect kitchen --deep")]
     Inspect(InspectArgs),
@@ -303,6 +311,24 @@ pub struct EvalArgs {
     pub scene: Option<PathBuf>,
 }
 
+/// `divff bench`.
+#[derive(Debug, Args)]
+pub struct BenchArgs {
+    /// Scene with ground truth [default: a synthetic one, made in the folder]
+    pub scene: Option<PathBuf>,
+    /// Folder for tables, plots and runs
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// What is varied: training, encoding, voxel, method, features, export
+    #[arg(long, value_delimiter = ',', value_parser = Kind::from_str, default_values = Kind::ALL.map(Kind::name))]
+    pub sweeps: Vec<Kind>,
+    /// Fewer settings and short runs: under five minutes on two cores with the synthetic scene
+    #[arg(long)]
+    pub quick: bool,
+    #[command(flatten)]
+    pub settings: SettingsArgs,
+}
+
 /// `divff inspect`.
 #[derive(Debug, Args)]
 pub struct InspectArgs {
@@ -366,6 +392,9 @@ mod tests {
     #[test]
     fn what_does_not_exist_yet_is_not_offered() {
         let names: Vec<String> = Cli::command().get_subcommands().map(|c| c.get_name().to_owned()).collect();
-        assert_eq!(names, ["demo", "synth", "run", "train", "export", "render", "query", "eval", "inspect"]);
+        assert_eq!(
+            names,
+            ["demo", "synth", "run", "train", "export", "render", "query", "eval", "bench", "inspect"]
+        );
     }
 }

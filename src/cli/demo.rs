@@ -5,6 +5,7 @@ use std::path::Path;
 
 use divff::config::{Config, Preset};
 use divff::pipeline::{self, Outcome, RunFolder, RunOptions};
+use divff::scene::Scene;
 use divff::synth::{SynthOptions, SynthSummary, generate};
 use divff::train::StreamChoice;
 
@@ -16,7 +17,7 @@ use super::run::{open, summary};
 use super::stop::StopFlag;
 
 /// Frames of the demo's video: enough for every place to be seen from several sides.
-const DEMO_FRAMES: u32 = 200;
+pub const DEMO_FRAMES: u32 = 200;
 
 /// `divff synth`.
 pub fn synth(args: &SynthArgs) -> Result<(), CliError> {
@@ -31,15 +32,7 @@ pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
     let (scene_path, run_path) = (args.out.join("scene"), args.out.join("run"));
     let options = SynthOptions { frames: DEMO_FRAMES, seed: args.seed, ..SynthOptions::default() };
     let mut reporter = Reporter::new(stop);
-    // A demo that was stopped goes on: its scene is complete as soon as it has its list of frames.
-    if scene_path.join("transforms.json").is_file() {
-        reporter.note(&format!("scene: {} is there already", scene_path.display()));
-    } else {
-        clear_half_made(&scene_path)?;
-        let made = generate(&options, &scene_path)?;
-        reporter.note(&format!("scene: {}: {}", scene_path.display(), described(&made)));
-    }
-    let scene = open(&scene_path, &reporter)?;
+    let scene = own_scene(&scene_path, &options, &reporter)?;
     let mut config = Config::preset(Preset::Draft);
     config.seed = args.seed;
     // The short budget is too short to find out that something moves; here it is known.
@@ -61,12 +54,25 @@ pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
     }
 }
 
+/// The synthetic scene in a folder of a command of ours, made unless it is there.
+pub fn own_scene(path: &Path, options: &SynthOptions, reporter: &Reporter) -> Result<Scene, CliError> {
+    // A command that was stopped goes on: its scene is complete as soon as it has its list of frames.
+    if path.join("transforms.json").is_file() {
+        reporter.note(&format!("scene: {} is there already", path.display()));
+    } else {
+        clear_half_made(path)?;
+        let made = generate(options, path)?;
+        reporter.note(&format!("scene: {}: {}", path.display(), described(&made)));
+    }
+    open(path, reporter)
+}
+
 /// Removes the pictures of a scene whose making was cut off; nothing else is ever in this folder.
 fn clear_half_made(scene: &Path) -> Result<(), CliError> {
     match fs::remove_dir_all(scene) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(CliError::Input {
             path: scene.to_owned(),
-            what: format!("what an earlier demo left cannot be removed: {e}"),
+            what: format!("what an earlier one left cannot be removed: {e}"),
             remedy: "choose another --out",
         }),
         _ => Ok(()),

@@ -1,6 +1,7 @@
 //! The command line: arguments in, a few library calls, one message and an exit code out.
 
 mod args;
+mod bench;
 mod demo;
 mod error;
 mod inspect;
@@ -58,6 +59,7 @@ fn dispatch(cli: Cli) -> Result<(), CliError> {
         Command::Render(args) => run::render(args, stop()?),
         Command::Query(args) => query::query(args),
         Command::Eval(args) => run::eval(args, stop()?),
+        Command::Bench(args) => bench::bench(args, stop()?),
         Command::Inspect(args) => inspect::inspect(args),
     }
 }

@@ -100,6 +100,7 @@ impl Observer for Reporter {
                 Stage::Evaluating => "evaluating",
                 Stage::Reporting => "reporting",
             }),
+            Event::Setting { sweep, setting } => self.note(&format!("{sweep}: {setting}")),
             Event::Resuming { step, seconds } => {
                 self.note(&format!("going on after step {step} ({} of training)", human(*seconds)));
             }

@@ -152,6 +152,27 @@ fn nothing_evaluated_is_an_empty_mesh() {
     assert_eq!(march_dense(&[], [0, 4, 4], 0.0).unwrap(), TriMesh::default());
 }
 
+#[test]
+fn dense_grids_of_every_shape_are_manifold_and_whole() {
+    // One cell, rows of less than, exactly and just more than a word, and layers of a single row of cells.
+    for dims in [[2, 2, 2], [2, 5, 3], [63, 4, 3], [64, 3, 4], [65, 2, 2], [66, 3, 5], [129, 4, 2]] {
+        let [nx, ny, nz]: [usize; 3] = dims;
+        let at = |i: usize| [i % nx, i / nx % ny, i / (nx * ny)];
+        let value = |i: usize| noise(Vec3A::from_array(at(i).map(|c| c as f32)));
+        let values: Vec<f32> = (0..nx * ny * nz).map(value).collect();
+        let mesh = march_dense(&values, dims, 0.0).unwrap();
+        assert_manifold(&mesh);
+        // Every cut edge has its vertex, and no other edge.
+        let cut = |i: usize, step: usize| (values[i] > 0.0) != (values[i + step] > 0.0);
+        let cuts = |axis: usize| {
+            let step = [1, nx, nx * ny][axis];
+            (0..values.len()).filter(|i| at(*i)[axis] + 1 < dims[axis] && cut(*i, step)).count()
+        };
+        assert_eq!(mesh.positions.len(), (0..3).map(cuts).sum::<usize>(), "{dims:?}");
+        assert!(mesh.triangles.iter().flatten().all(|v| (*v as usize) < mesh.positions.len()));
+    }
+}
+
 /// Triangles by the exact positions of their corners, rotated to a canonical first corner.
 fn soup(mesh: &TriMesh, scale: f32) -> HashSet<[[u32; 3]; 3]> {
     let key = |t: &[u32; 3]| {

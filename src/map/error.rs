@@ -48,7 +48,7 @@ impl From<SceneError> for MapError {
 }
 
 impl MapError {
-    pub(super) fn extract(what: &str) -> impl FnOnce(ExtractError) -> Self {
+    pub(crate) fn extract(what: &str) -> impl FnOnce(ExtractError) -> Self {
         let what = what.to_owned();
         move |source| Self::Extract { what, source }
     }

@@ -26,6 +26,7 @@ use serde::Serialize;
 pub use self::build::{Progress, Stage, build};
 pub use self::config::{MapConfig, SurfaceMethod, TimePoint, Times};
 pub use self::error::MapError;
+pub use self::place::default_voxel;
 pub use self::write::{Format, write};
 use crate::field::{Normalisation, Stream};
 

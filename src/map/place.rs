@@ -14,7 +14,7 @@ const VOXELS_PER_DIAGONAL: f64 = 350.0;
 const UP_COSINE: f64 = 0.866;
 
 /// The default voxel size, world units.
-pub(super) fn default_voxel(n: &Normalisation) -> f64 {
+pub fn default_voxel(n: &Normalisation) -> f64 {
     n.extent.as_dvec3().length() * n.scale / VOXELS_PER_DIAGONAL
 }
 

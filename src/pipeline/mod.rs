@@ -73,6 +73,13 @@ pub enum Event<'a> {
     Training(&'a Progress),
     /// Training of the fields of features moves on.
     Features(&'a HeadProgress),
+    /// A benchmark turns to a setting.
+    Setting {
+        /// The sweep.
+        sweep: &'a str,
+        /// The setting.
+        setting: &'a str,
+    },
     /// The map is being built.
     Mapping(crate::map::Progress),
     /// Frames are being rendered.

@@ -7,7 +7,7 @@ use crate::eval::surface::SurfaceMetrics;
 use crate::pipeline::RunMetrics;
 use crate::scene::{Scene, Split};
 
-const STYLE: &str = include_str!("style.css");
+pub(crate) const STYLE: &str = include_str!("style.css");
 
 /// Everything that the page shows.
 pub struct Page<'a> {
@@ -295,7 +295,7 @@ fn size(bytes: u64) -> String {
     }
 }
 
-fn escaped(text: &str) -> String {
+pub(crate) fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 

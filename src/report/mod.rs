@@ -2,11 +2,11 @@
 //!
 //! Everything in it is read from the run's folder, so that the report shows what is really on the disk.
 
-mod chart;
+pub(crate) mod chart;
 mod colour;
 mod embed;
 mod features;
-mod html;
+pub(crate) mod html;
 pub mod raster;
 pub mod tables;
 

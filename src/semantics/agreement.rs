@@ -137,13 +137,18 @@ fn answers_iou(
     compressor.encode(&rows, &mut codes);
     let whole = text.plain_queries(space, &phrases, temperature)?.score(Points::F32(&rows))?.scores;
     let short = text.queries(space, compressor, &phrases, temperature)?.score(Points::F32(&codes))?.scores;
+    Ok(mean_answers_iou(&whole, &short))
+}
+
+/// Mean over phrases of the IoU of what answers them by two lists of scores; `None` if nothing answers any of them.
+pub(crate) fn mean_answers_iou(a: &[Vec<f32>], b: &[Vec<f32>]) -> Option<f64> {
     let iou = |(a, b): (&Vec<f32>, &Vec<f32>)| {
         let pairs = || a.iter().zip(b).map(|(a, b)| (*a > ANSWERS, *b > ANSWERS));
         let (both, any) = (pairs().filter(|p| p.0 && p.1).count(), pairs().filter(|p| p.0 || p.1).count());
         (any > 0).then(|| both as f64 / any as f64)
     };
-    let ious: Vec<f64> = whole.iter().zip(&short).filter_map(iou).collect();
-    Ok((!ious.is_empty()).then(|| ious.iter().sum::<f64>() / ious.len() as f64))
+    let ious: Vec<f64> = a.iter().zip(b).filter_map(iou).collect();
+    (!ious.is_empty()).then(|| ious.iter().sum::<f64>() / ious.len() as f64)
 }
 
 /// At most [`FRAMES`] of a list, evenly spread.
@@ -199,7 +204,7 @@ impl Compared<'_> {
 }
 
 /// Cosine of two vectors; 0 where one is zero.
-fn cosine(a: &[f32], b: &[f32]) -> f64 {
+pub(crate) fn cosine(a: &[f32], b: &[f32]) -> f64 {
     let dot =
         |a: &[f32], b: &[f32]| -> f64 { a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum() };
     let norms = (dot(a, a) * dot(b, b)).sqrt();

@@ -199,7 +199,7 @@ fn a_closed_pipe_is_not_a_failure() {
 #[test]
 fn every_command_explains_itself_with_an_example() {
     assert!(divff(&["--version"]).ok().starts_with("divff "));
-    for command in ["demo", "synth", "run", "train", "export", "render", "eval", "inspect"] {
+    for command in ["demo", "synth", "run", "train", "export", "render", "eval", "bench", "inspect"] {
         let help = divff(&[command, "--help"]).ok();
         assert!(help.contains(&format!("divff {command}")) && help.contains("Example"), "{help}");
     }

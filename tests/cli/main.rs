@@ -1,5 +1,6 @@
 //! The `divff` program from outside: what every command makes, says and returns.
 
+mod bench;
 mod broken_features;
 mod broken_input;
 mod commands;
