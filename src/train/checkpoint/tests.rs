@@ -31,7 +31,7 @@ fn random(seed: u64) -> (Trained, Optimiser) {
         unexplained: Some(0.125),
         aligned: 2,
         joint: 0,
-        stereo_from: Some(vec![1.5e-3, -0.1, 0.0]),
+        stereo_from: Some((0..field.layout.refinement().len()).map(|n| 1.5e-3 * n as f32).collect()),
     };
     let mut trained = Trained { field, grids, progress };
     trained.visit_mut(&mut fill).expect("filling cannot fail");
