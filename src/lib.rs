@@ -6,6 +6,8 @@
 #![deny(unsafe_code)]
 
 mod bvh;
+#[cfg(test)]
+mod bvh_tests;
 pub mod config;
 pub mod error;
 pub mod eval;
