@@ -143,18 +143,50 @@ impl Config {
         let samples = (2..=256).contains(&t.samples);
         range("train.samples", t.samples.to_string(), samples, "must be 2 to 256")?;
         range("train.patch", t.patch.to_string(), [1, 2, 4].contains(&t.patch), "must be 1, 2 or 4")?;
+        let samples = (1..=1024).contains(&t.render_samples);
+        range("train.render_samples", t.render_samples.to_string(), samples, "must be 1 to 1024")?;
         let cells = (8.0..=1024.0).contains(&t.grid_cells);
         range("train.grid_cells", t.grid_cells.to_string(), cells, "must be 8 to 1024")?;
-        for (key, rate) in [("train.table_rate", t.table_rate), ("train.network_rate", t.network_rate)] {
-            range(key, rate.to_string(), rate.is_finite() && rate >= 0.0, "must be finite and not negative")?;
+        let l = &self.loss;
+        for (key, size) in [
+            ("train.table_rate", t.table_rate),
+            ("train.network_rate", t.network_rate),
+            ("train.exposure_rate", t.exposure_rate),
+            ("train.pose_rate", t.pose_rate),
+            ("train.rig_rate", t.rig_rate),
+            ("train.sharpness", t.sharpness),
+            ("loss.transient", l.transient),
+            ("loss.transient_opacity", l.transient_opacity[0]),
+            ("loss.transient_opacity", l.transient_opacity[1]),
+            ("loss.moving", l.moving),
+            ("loss.distortion", l.distortion),
+            ("loss.entropy", l.entropy),
+            ("loss.depth", l.depth),
+            ("loss.flatness", l.flatness),
+            ("loss.exposure", l.exposure),
+        ] {
+            range(key, size.to_string(), size.is_finite() && size >= 0.0, "must be finite and not negative")?;
         }
-        for (key, share) in [("train.stereo_at", t.stereo_at), ("train.static_until", t.static_until)] {
+        for (key, share) in [
+            ("train.stereo_at", t.stereo_at),
+            ("train.static_until", t.static_until),
+            ("train.refine_from", t.refine_from),
+            ("train.skip_from", t.skip_from),
+            ("train.grid_rate", f64::from(t.grid_rate)),
+        ] {
             range(key, share.to_string(), (0.0..=1.0).contains(&share), "must be 0 to 1")?;
         }
+        let explore = t.explore.iter().all(|e| (0.0..1.0).contains(e));
+        range("train.explore", format!("{:?}", t.explore), explore, "must be from 0 to below 1")?;
+        let seconds = t.checkpoint_seconds;
+        range("train.checkpoint_seconds", seconds.to_string(), seconds >= 0.0, "must not be negative")?;
         let sorted = t.align_at.is_sorted() && t.align_at.iter().all(|a| (0.0..=1.0).contains(a));
         range("train.align_at", format!("{:?}", t.align_at), sorted, "must be rising numbers from 0 to 1")?;
         self.stereo.validate()?;
-        let b = self.loss.beta_min;
+        let (near, reach) = (self.field.near, self.field.actor_reach);
+        let ordered = near > 0.0 && reach > near && reach.is_finite();
+        range("field.near", format!("{near} and actor_reach {reach}"), ordered, "0 < near < actor_reach")?;
+        let b = l.beta_min;
         range("loss.beta_min", b.to_string(), b.is_finite() && b > 0.0, "must be positive")?;
         for (key, c) in [
             ("field.persistent", &self.field.persistent),
@@ -168,8 +200,13 @@ impl Config {
                 && c.finest <= 65536.0
                 && (4..=512).contains(&c.hidden)
                 && (1..=8).contains(&c.layers)
-                && c.code <= 64;
-            let remedy = "levels 1-16, log2_rows 1-24, 1 <= coarsest <= finest <= 65536, hidden 4-512, layers 1-8, code <= 64";
+                && c.code <= 64
+                && c.knots <= 65536
+                && (c.time_levels == 0 || c.time_levels <= 8 && (1.0..=65536.0).contains(&c.time_finest))
+                && c.density_bias.abs() <= 15.0;
+            let remedy = "levels 1-16, log2_rows 1-24, 1 <= coarsest <= finest <= 65536, hidden 4-512, layers 1-8, \
+                          code <= 64, knots <= 65536, time_levels <= 8, 1 <= time_finest <= 65536, \
+                          density_bias within 15";
             range(key, format!("{c:?}"), ok, remedy)?;
         }
         let semantics = self.semantics.check();

@@ -7,6 +7,8 @@
 
 pub mod bench;
 mod bvh;
+#[cfg(test)]
+mod bvh_tests;
 pub mod config;
 pub mod error;
 pub mod eval;

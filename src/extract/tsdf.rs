@@ -66,8 +66,8 @@ impl TsdfVolume {
     ///
     /// # Errors
     /// `Length` where a map does not fit its camera, `NonFinite` ("depth map", "depth confidence": index over
-    /// all pixels of all frames in order; "camera": index of the frame), `Invalid` and `TooLarge` as the
-    /// grid.
+    /// all pixels of all frames in order; "camera": index of the frame; "fused depth": index of the corner over
+    /// all blocks that are near the depth), `Invalid` and `TooLarge` as the grid.
     pub fn fuse(spec: &GridSpec, frames: &[DepthFrame], options: &TsdfOptions) -> Result<Self, ExtractError> {
         spec.validate()?;
         let positive = options.truncation.is_finite() && options.truncation > 0.0;
@@ -88,16 +88,15 @@ impl TsdfVolume {
 
         let blocks = &grid.blocks;
         let parts = grid.values.par_chunks_mut(POINTS).zip(weights.par_chunks_mut(POINTS));
-        if colored {
-            parts.zip(colors.par_chunks_mut(POINTS)).enumerate().for_each(
-                |(b, ((values, weights), colors))| {
-                    integrate(spec, blocks, b, &maps, options).store(options, values, weights, Some(colors));
-                },
-            );
+        let sums = |b: usize| integrate(spec, blocks, b, &maps, options);
+        let diverged: Vec<Option<usize>> = if colored {
+            let parts = parts.zip(colors.par_chunks_mut(POINTS)).enumerate();
+            parts.map(|(b, ((v, w), colors))| sums(b).store(options, v, w, Some(colors))).collect()
         } else {
-            parts.enumerate().for_each(|(b, (values, weights))| {
-                integrate(spec, blocks, b, &maps, options).store(options, values, weights, None);
-            });
+            parts.enumerate().map(|(b, (v, w))| sums(b).store(options, v, w, None)).collect()
+        };
+        if let Some((b, i)) = diverged.into_iter().enumerate().find_map(|(b, i)| Some((b, i?))) {
+            return Err(ExtractError::NonFinite { stage: "fused depth", index: b * POINTS + i });
         }
         grid.blocks.share_borders(&mut grid.values);
         grid.blocks.share_borders(&mut weights);
@@ -188,8 +187,8 @@ struct Map<'a> {
     /// Largest depth of any pixel, per tile.
     tiles: Vec<f32>,
     tiles_x: usize,
-    /// Squared mean depth over all frames: the depth at which a view weighs 1.
-    reference2: f32,
+    /// Mean depth over all frames: the depth at which a view weighs 1.
+    reference: f32,
 }
 
 impl<'a> Map<'a> {
@@ -203,7 +202,7 @@ impl<'a> Map<'a> {
             })
             .collect();
         let (sum, n) = sums.iter().fold((0.0, 0), |(s, n), x| (s + x.0, n + x.1));
-        let reference2 = (sum / n.max(1) as f64).powi(2) as f32;
+        let reference = (sum / n.max(1) as f64) as f32;
         let map = |(i, frame): (usize, &'a DepthFrame)| {
             let view = View::new(&frame.camera, &frame.c2w, spec.origin, i)?;
             let (tiles_x, tiles_y) = (view.width.div_ceil(TILE), view.height.div_ceil(TILE));
@@ -212,7 +211,7 @@ impl<'a> Map<'a> {
                 let tile = &mut tiles[p / view.width / TILE * tiles_x + p % view.width / TILE];
                 *tile = tile.max(d);
             }
-            Ok(Self { frame, view, tiles, tiles_x, reference2 })
+            Ok(Self { frame, view, tiles, tiles_x, reference })
         };
         frames.par_iter().enumerate().map(map).collect()
     }
@@ -300,13 +299,14 @@ struct Sums {
 }
 
 impl Sums {
+    /// Writes the means; the first corner whose sums have left the range of f32, if there is one.
     fn store(
         &self,
         o: &TsdfOptions,
         values: &mut [f32],
         weights: &mut [f32],
         colors: Option<&mut [[f32; 3]]>,
-    ) {
+    ) -> Option<usize> {
         for i in 0..POINTS {
             let w = self.weight[i];
             if w > 0.0 && w >= o.min_weight {
@@ -321,6 +321,7 @@ impl Sums {
                 *out = if w > 0.0 { self.color[i].map(|c| c / w) } else { [-1.0; 3] };
             }
         }
+        (0..POINTS).find(|&i| !(self.weight[i].is_finite() && self.distance[i].is_finite()))
     }
 }
 
@@ -380,7 +381,7 @@ fn add_view(sums: &mut Sums, i: usize, map: &Map, p: Vec3A, o: &TsdfOptions) {
     // Behind the surface a view knows less and less: full weight down to a quarter of the truncation
     // distance, then a ramp to none (Bylow et al. 2013). Thin parts seen from both sides survive so.
     let behind = ((truncation + distance) / (0.75 * truncation)).min(1.0);
-    let weight = confidence * behind * map.reference2 / (depth * depth);
+    let weight = confidence * behind * (map.reference / depth).powi(2);
     sums.weight[i] += weight;
     sums.distance[i] += weight * (distance / truncation).min(1.0);
     if let (Some(rgb), true) = (map.frame.rgb, distance < truncation) {

@@ -13,6 +13,9 @@ const TILES: usize = 3;
 /// Networks of odd widths, one to four layers.
 const SHAPES: [&[usize]; 4] = [&[1, 1], &[5, 7, 3], &[13, 6, 9, 4], &[33, 18, 1, 17, 2]];
 
+/// Networks that are compared with f64.
+const SEEDS: usize = 100;
+
 /// A network, inputs and output gradients, all random.
 struct Case {
     net: Mlp,
@@ -125,7 +128,7 @@ fn close(a: f32, b: f64, what: &str) {
 
 #[test]
 fn networks_match_f64_loops_forward_and_backward() {
-    for (n, widths) in SHAPES.into_iter().enumerate() {
+    for (n, widths) in SHAPES.into_iter().cycle().take(SEEDS).enumerate() {
         let case = Case::new(widths, n as u64);
         let out = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
         let mut sums = vec![0.0; case.net.parameters()];

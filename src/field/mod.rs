@@ -226,6 +226,11 @@ impl FieldConfig {
 }
 
 impl Layout {
+    /// Everything that moves cameras: poses and rig.
+    pub fn refinement(&self) -> Range<usize> {
+        self.pose.start..self.rig.end
+    }
+
     fn new(
         nets: &[Option<StreamNet>; 3],
         codes: &[Option<Trajectory>; 3],

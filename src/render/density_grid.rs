@@ -20,9 +20,18 @@ pub struct DensityGrid {
 impl DensityGrid {
     /// Cells of `cell` units in `slices` slices of time; every cell starts at `sigma`.
     pub fn new(extent: Vec3, cell: Vec3, slices: usize, sigma: f32) -> Self {
-        let dims = (extent / cell).ceil().max(Vec3::ONE).as_uvec3();
-        let cells = dims.as_usizevec3().element_product() * slices;
+        let dims = Self::dims_of(extent, cell);
+        let cells = Self::cells(extent, cell, slices);
         Self { dims, per_unit: dims.as_vec3() / extent, slices, sigma: vec![sigma; cells] }
+    }
+
+    /// Numbers that a grid of [`Self::new`] holds.
+    pub fn cells(extent: Vec3, cell: Vec3, slices: usize) -> usize {
+        Self::dims_of(extent, cell).as_usizevec3().element_product() * slices
+    }
+
+    fn dims_of(extent: Vec3, cell: Vec3) -> UVec3 {
+        (extent / cell).ceil().max(Vec3::ONE).as_uvec3()
     }
 
     /// Edge lengths of a cell, units.

@@ -25,12 +25,28 @@ pub struct Grids {
 impl Grids {
     /// Fresh grids with `cells` cells along the longest side of the box.
     pub fn new(field: &Field, cells: f32) -> Self {
-        let extent = field.normalisation.extent;
-        let start = field.nets[0].as_ref().map_or(0.0, |n| n.density_bias.exp());
-        let persistent = DensityGrid::new(extent, Vec3::splat(1.0 / cells), 1, start);
-        let dynamic = DensityGrid::new(extent, Vec3::splat(2.0 / cells), TIME_SLICES, UNKNOWN);
-        let actor = DensityGrid::new(Vec3::ONE, Vec3::splat(1.0 / ACTOR_CELLS), TIME_SLICES, UNKNOWN);
-        Self { streams: [persistent, dynamic, actor], threshold: [0.0; 3] }
+        let empty = field.nets[0].as_ref().map_or(0.0, |n| n.density_bias.exp());
+        let grids = Self::layout(field.normalisation.extent, cells);
+        let start = [empty, UNKNOWN, UNKNOWN];
+        let grid = |s: usize| {
+            let (extent, cell, slices) = grids[s];
+            DensityGrid::new(extent, cell, slices, start[s])
+        };
+        Self { streams: [0, 1, 2].map(grid), threshold: [0.0; 3] }
+    }
+
+    /// Numbers that each grid of [`Self::new`] holds, for a box of `extent`.
+    pub fn cells(extent: Vec3, cells: f32) -> [usize; 3] {
+        Self::layout(extent, cells).map(|(extent, cell, slices)| DensityGrid::cells(extent, cell, slices))
+    }
+
+    /// Extent, cell and slices of time of each grid.
+    fn layout(extent: Vec3, cells: f32) -> [(Vec3, Vec3, usize); 3] {
+        [
+            (extent, Vec3::splat(1.0 / cells), 1),
+            (extent, Vec3::splat(2.0 / cells), TIME_SLICES),
+            (Vec3::ONE, Vec3::splat(1.0 / ACTOR_CELLS), TIME_SLICES),
+        ]
     }
 }
 

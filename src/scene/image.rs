@@ -78,10 +78,8 @@ impl Frame {
         if bytes.starts_with(&[0xff, 0xd8]) && !header::jpeg_is_complete(&bytes) {
             return Err(damaged(format!("the {kind} ends too early ({} bytes)", bytes.len())));
         }
-        let cannot = |e: image::ImageError| damaged(format!("the {kind} cannot be decoded: {e}"));
-        let mut reader = ImageReader::new(std::io::Cursor::new(bytes));
-        reader = reader.with_guessed_format().map_err(|e| SceneError::io(path, e))?;
-        let decoder = reader.into_decoder().map_err(cannot)?;
+        let cannot = |e: String| damaged(format!("the {kind} cannot be decoded: {e}"));
+        let decoder = decoder(&bytes).map_err(cannot)?;
         // Before decoding: a damaged header must not decide how much is allocated.
         let (width, height) = decoder.dimensions();
         let camera = (self.camera.width, self.camera.height);
@@ -93,6 +91,26 @@ impl Frame {
                 "resize it to the size of the frame's image",
             ));
         }
-        DynamicImage::from_decoder(decoder).map_err(cannot)
+        DynamicImage::from_decoder(decoder).map_err(|e| cannot(e.to_string()))
     }
+}
+
+/// Most bytes of pixels that a byte of a file stands for: 1032 in deflate (PNG), some 1400 in a JPEG whose blocks are
+/// one bit each.
+const MOST_EXPANSION: u64 = 2048;
+
+/// A decoder of a JPEG or PNG that has read the header and no pixel. A header that promises more pixels than the file
+/// can hold is refused, so that it does not decide how much is allocated.
+///
+/// # Errors
+/// What is wrong.
+pub(crate) fn decoder(bytes: &[u8]) -> Result<impl ImageDecoder + '_, String> {
+    let reader = ImageReader::new(std::io::Cursor::new(bytes));
+    let reader = reader.with_guessed_format().map_err(|e| e.to_string())?;
+    let decoder = reader.into_decoder().map_err(|e| e.to_string())?;
+    if decoder.total_bytes() > MOST_EXPANSION * bytes.len() as u64 {
+        let (width, height) = decoder.dimensions();
+        return Err(format!("{width}×{height} pixels are announced, which {} bytes cannot hold", bytes.len()));
+    }
+    Ok(decoder)
 }

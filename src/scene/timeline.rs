@@ -46,6 +46,14 @@ pub(crate) fn complete(draft: &mut Draft, warnings: &mut Vec<String>) -> Result<
         warnings.push(format!("times run from {first} to {last}; they are stretched to 0…1"));
     }
     let span = if last > first { last - first } else { 1.0 };
+    if !span.is_finite() {
+        return Err(SceneError::invalid(
+            &draft.source,
+            Place::Key("time".into()),
+            format!("times run from {first:e} to {last:e}, which is more than can be divided"),
+            "give times in seconds, or from 0 to 1",
+        ));
+    }
     for frame in &mut draft.frames {
         frame.time = Some((time(frame) - first) / span);
     }

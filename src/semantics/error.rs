@@ -24,6 +24,22 @@ pub enum SemanticsError {
     /// Descriptors cannot be compressed.
     #[error("descriptors cannot be compressed: {0}")]
     Compress(#[from] CompressError),
+    /// The numbers have left the range of f32: the learning rate is too high.
+    #[error(
+        "{stage} of the {} features is not finite at step {step} (index {index}); lower semantics.table_rate and \
+         semantics.network_rate",
+        space.name()
+    )]
+    NonFinite {
+        /// What was being computed.
+        stage: &'static str,
+        /// Whose features.
+        space: Space,
+        /// Training step.
+        step: u64,
+        /// Index within the stage.
+        index: usize,
+    },
     /// Points cannot be held against phrases.
     #[error(transparent)]
     Relevancy(#[from] RelevancyError),

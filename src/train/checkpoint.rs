@@ -12,7 +12,7 @@ use super::step::Optimiser;
 use crate::config::Config;
 use crate::error::{BadFile, FileError};
 use crate::field::hashgrid::Row;
-use crate::field::{Field, FieldShape, Stream};
+use crate::field::{Field, FieldShape, Normalisation, Stream};
 use crate::render::forward::Grids;
 
 #[cfg(test)]
@@ -78,19 +78,25 @@ impl Header {
     /// Refuses a header that asks for a field which cannot be, or is larger than a file of `bytes`.
     ///
     /// # Errors
-    /// [`TrainError::Config`] or [`TrainError::Checkpoint`].
+    /// [`TrainError::Checkpoint`].
     fn check(&self, path: &Path, bytes: usize) -> Result<(), TrainError> {
         let mut config = Config { field: self.shape.config.clone(), ..Config::default() };
         config.train.grid_cells = self.grid_cells;
-        config.validate()?;
+        config.validate().map_err(|e| damaged(path, &e.to_string()))?;
         let shape = &self.shape;
-        let extent = shape.normalisation.extent;
+        let Normalisation { origin, scale, extent } = shape.normalisation;
         let sound = extent.min_element() > 0.0
             && extent.max_element() <= 1.0
+            && scale > 0.0
+            && (origin.abs() + scale).is_finite()
             && !shape.times.is_empty()
-            && shape.times.iter().all(|t| t.is_finite());
+            && shape.times.iter().chain(&shape.background).all(|t| t.is_finite());
         if !sound {
             return Err(damaged(path, "its box or its times are not those of a scene"));
+        }
+        let cells: usize = Grids::cells(extent, self.grid_cells).iter().sum();
+        if cells.saturating_mul(size_of::<f32>()) > bytes {
+            return Err(damaged(path, "it is shorter than the density grids of its header"));
         }
         let rows: usize = Stream::ALL
             .into_iter()
@@ -206,6 +212,10 @@ impl Trained {
         }
         header.check(&path, bytes.len())?;
         let field = Field::zeros(header.shape);
+        let refinement = field.layout.refinement().len();
+        if header.progress.stereo_from.as_ref().is_some_and(|from| from.len() != refinement) {
+            return Err(damaged(&path, "the poses of its stereo are not those of its frames"));
+        }
         let mut grids = Grids::new(&field, header.grid_cells);
         grids.threshold = header.threshold;
         let mut trained = Self { field, grids, progress: header.progress };

@@ -26,6 +26,8 @@ mod gradient_tests;
 mod group;
 #[cfg(test)]
 mod reference;
+#[cfg(test)]
+mod seed_tests;
 mod update;
 
 /// Groups that a step is divided into; fixed, so that sums are taken in the same order on any machine.
@@ -90,6 +92,8 @@ pub struct StepReport {
     pub evaluations: usize,
     /// Samples placed, times streams: what would have been evaluated without occupancy.
     pub candidates: usize,
+    /// Number of the first chunk of rays whose loss is not finite.
+    pub diverged: Option<usize>,
 }
 
 /// All state of training but the field itself.
@@ -154,6 +158,7 @@ impl Optimiser {
             report.loss += g.loss.total / rays as f64;
             report.squared += g.loss.squared / rays as f64;
             report.evaluations += g.evaluations;
+            report.diverged = report.diverged.or(g.diverged);
         }
         let live = plan.streams.iter().filter(|s| **s).count();
         report.candidates = rays * plan.sampling.count * live;

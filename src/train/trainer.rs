@@ -249,8 +249,17 @@ impl Trainer {
     /// Stores the field and what is needed to go on training it.
     ///
     /// # Errors
-    /// A file that cannot be written; an older one is then untouched.
+    /// A number that is not finite, or a file that cannot be written; an older one is then untouched.
     pub fn save(&self, run: &Path) -> Result<(), TrainError> {
+        // A row that has diverged shows in the loss when a ray passes it next, which may be never.
+        let rows = self.trained.field.tables.iter().flatten().flatten();
+        if let Some(index) = rows.into_iter().position(|row| !row.is_finite()) {
+            return Err(TrainError::NonFinite {
+                stage: "a row of the tables",
+                step: self.trained.progress.step,
+                index,
+            });
+        }
         self.trained.save(run, self.config.train.grid_cells, Some(&self.optimiser))
     }
 
@@ -280,8 +289,8 @@ impl Trainer {
         let Config { loss, seed, .. } = &self.config;
         let report = self.optimiser.step(field, grids, &self.pixels, loss, &plan, *seed, companion);
         let non_finite = |stage, index| TrainError::NonFinite { stage, step: progress.step, index };
-        if !report.loss.is_finite() {
-            return Err(non_finite("the loss", 0));
+        if let Some(chunk) = report.diverged {
+            return Err(non_finite("the loss of a chunk of rays", chunk));
         }
         match field.weights.iter().position(|w| !w.is_finite()) {
             Some(index) => Err(non_finite("a network weight", index)),
@@ -334,7 +343,7 @@ impl Trainer {
             self.settle_poses();
         }
         let Trained { field, progress, .. } = &mut self.trained;
-        let refinement = field.layout.pose.start..field.layout.rig.end;
+        let refinement = field.layout.refinement();
         let now = field.weights[refinement.clone()].to_vec();
         let then = progress.stereo_from.get_or_insert_with(|| now.clone());
         field.weights[refinement.clone()].copy_from_slice(then);

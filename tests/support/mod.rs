@@ -104,18 +104,22 @@ fn column(dim: usize, kind: &str, feature: bool, values: &[f32]) -> Value {
         "dim": dim,
         "type": kind,
         "feature": feature,
-        "crc32": crc32(values),
+        "crc32": crc32_of(values),
         "rows": sampled,
         "values": samples,
     })
 }
 
-/// CRC-32 (as in zip) of the values as little-endian f32. Adding 0 turns -0 into 0, which readers may do too.
-fn crc32(values: &[f32]) -> u32 {
+/// [`crc32`] of the values as little-endian f32. Adding 0 turns -0 into 0, which readers may do too.
+fn crc32_of(values: &[f32]) -> u32 {
+    crc32(values.iter().flat_map(|value| (value + 0.0).to_le_bytes()))
+}
+
+/// CRC-32, as in zip and PNG.
+pub fn crc32(bytes: impl Iterator<Item = u8>) -> u32 {
     let table: [u32; 256] = std::array::from_fn(|byte| {
         (0..8).fold(byte as u32, |crc, _| if crc & 1 == 1 { (crc >> 1) ^ 0xEDB8_8320 } else { crc >> 1 })
     });
-    let bytes = values.iter().flat_map(|value| (value + 0.0).to_le_bytes());
     !bytes.fold(!0, |crc, byte| table[((crc ^ u32::from(byte)) & 0xFF) as usize] ^ (crc >> 8))
 }
 

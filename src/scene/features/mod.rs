@@ -307,7 +307,9 @@ impl FrameFeatures<'_> {
     pub fn hotspot(&self) -> Result<Option<Hotspot>, FeatureError> {
         let Some(path) = self.store.hotspots.file(&self.frame.stem, "", "png") else { return Ok(None) };
         let bytes = std::fs::read(&path).map_err(|e| SceneError::io(&path, e))?;
-        let picture = image::load_from_memory_with_format(&bytes, image::ImageFormat::Png).map_err(|e| {
+        let decoded = super::image::decoder(&bytes)
+            .and_then(|decoder| image::DynamicImage::from_decoder(decoder).map_err(|e| e.to_string()));
+        let picture = decoded.map_err(|e| {
             let what = format!("the hotspot cannot be decoded: {e}");
             SceneError::image(&path, &self.frame.stem, what, "the file is damaged; write it again")
         })?;

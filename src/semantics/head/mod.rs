@@ -10,6 +10,7 @@ pub mod scale;
 mod step;
 #[cfg(test)]
 mod tests;
+mod told;
 pub mod train;
 
 use glam::Vec3;

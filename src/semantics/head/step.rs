@@ -15,6 +15,8 @@ use crate::field::hashgrid::FEATURES;
 use crate::field::mlp::{Activations, Precision};
 use crate::field::stream::StreamBatch;
 use crate::rng::Rng;
+use crate::scene::features::Space;
+use crate::semantics::SemanticsError;
 use crate::simd::TILE;
 use crate::simd::matrix::Unit;
 use crate::train::adam::{self, Moments, StepSize, TableState};
@@ -178,6 +180,24 @@ impl HeadOptimiser {
         drop(model);
         self.update(heads, plan);
         self.groups.iter().map(|g| g.loss).sum::<f64>() / f64::from(count)
+    }
+
+    /// Checks what the last step has left; `whole`: the tables, too, whose rows show in the loss when they are read
+    /// next, which may be never.
+    ///
+    /// # Errors
+    /// [`SemanticsError::NonFinite`].
+    pub fn check(&self, heads: &Heads, space: Space, step: u64, whole: bool) -> Result<(), SemanticsError> {
+        let loss = self.groups.iter().position(|g| !g.loss.is_finite());
+        let weight = || heads.weights.iter().flatten().position(|w| !w.is_finite());
+        let row = || heads.tables.iter().flatten().flatten().position(|r| !r.is_finite()).filter(|_| whole);
+        let found = (loss.map(|n| ("the loss of a group of rays", n)))
+            .or_else(|| Some(("a network weight", weight()?)))
+            .or_else(|| Some(("a row of the tables", row()?)));
+        match found {
+            Some((stage, index)) => Err(SemanticsError::NonFinite { stage, space, step, index }),
+            None => Ok(()),
+        }
     }
 
     fn update(&mut self, heads: &mut Heads, plan: &HeadStep) {

@@ -11,6 +11,7 @@ use super::cache::Sources;
 use super::render::pixel_ray;
 use super::scale::pyramid_targets;
 use super::step::{Bags, HeadOptimiser, HeadStep, JointPlan, RayTargets};
+use super::told::{Report, Told};
 use super::{HeadShape, Heads};
 use crate::config::Config;
 use crate::field::mlp::Precision;
@@ -35,9 +36,6 @@ const SAMPLED: usize = 8;
 
 /// Steps over which the learning rates rise to their full size.
 const WARM_UP: f32 = 50.0;
-
-/// Steps between two reports.
-const REPORT_EVERY: u64 = 50;
 
 /// Joint training goes through the schedules' rates from this share to their end.
 const JOINT_FROM: f64 = 0.85;
@@ -96,9 +94,6 @@ impl Targets {
     }
 }
 
-/// Whether to go on is asked after every report.
-type Report<'a> = dyn FnMut(&HeadProgress) -> ControlFlow<()> + 'a;
-
 /// Reads all features that training would read, so that what is wrong with them shows before geometry is trained.
 ///
 /// # Errors
@@ -118,7 +113,8 @@ pub fn check_features(scene: &Scene, config: &SemanticsConfig) -> Result<(), Sem
 /// `None` if `report` says stop.
 ///
 /// # Errors
-/// [`SemanticsError`] for features that cannot be used, [`SemanticsError::Train`] if geometry cannot be trained on.
+/// [`SemanticsError`] for features that cannot be used, [`SemanticsError::NonFinite`] where their training diverges,
+/// [`SemanticsError::Train`] if geometry cannot be trained on.
 pub fn train_features(
     scene: &Scene,
     session: &mut Session,
@@ -158,7 +154,7 @@ pub fn train_features(
     let steps = spaces.len() as u64 * settings.steps + settings.joint_steps;
     let mut alone = Told { report: &mut *report, done: 0, steps };
     for space in &mut spaces {
-        if space.train(config, &sources, &mut alone).is_break() {
+        if space.train(config, &sources, &mut alone)?.is_break() {
             return Ok(None);
         }
     }
@@ -207,34 +203,13 @@ fn train_jointly(
             let plan = plan(settings, config, settings.steps + n, share as f32, *space);
             let geometry = |companion: &dyn step::Companion| trainer.step(share, Some(companion)).map(drop);
             loss += optimiser.joint_step(heads, targets, pixel, (&plan, joint), geometry)?;
+            optimiser.check(heads, *space, plan.step, n == settings.joint_steps)?;
         }
         if told.add("with geometry", n, n == settings.joint_steps, loss).is_break() {
             return Ok(ControlFlow::Break(()));
         }
     }
     Ok(ControlFlow::Continue(()))
-}
-
-/// Reports now and then.
-struct Told<'a, 'b> {
-    report: &'a mut Report<'b>,
-    /// Steps of earlier phases, and of all.
-    done: u64,
-    steps: u64,
-}
-
-impl Told<'_, '_> {
-    /// Tells of step number `step` of a phase; `last`: the phase is over.
-    fn add(&mut self, what: &'static str, step: u64, last: bool, loss: f64) -> ControlFlow<()> {
-        if !step.is_multiple_of(REPORT_EVERY) && !last {
-            return ControlFlow::Continue(());
-        }
-        let fraction = (self.done + step) as f64 / self.steps.max(1) as f64;
-        if last {
-            self.done += step;
-        }
-        (self.report)(&HeadProgress { what, step, fraction, loss })
-    }
 }
 
 /// One pixel, at random, of each square of a size that keeps to the number of rays, where it has a target and no mask
@@ -424,16 +399,24 @@ struct SpaceTraining {
 
 impl SpaceTraining {
     /// Trains at frozen geometry.
-    fn train(&mut self, config: &Config, sources: &Sources, told: &mut Told) -> ControlFlow<()> {
+    fn train(
+        &mut self,
+        config: &Config,
+        sources: &Sources,
+        told: &mut Told,
+    ) -> Result<ControlFlow<()>, SemanticsError> {
         let Self { space, targets, heads, optimiser, .. } = self;
         let steps = config.semantics.steps;
         for step in 1..=if targets.usable.is_empty() { 0 } else { steps } {
             let share = (step - 1) as f32 / steps as f32;
             let plan = plan(&config.semantics, config, step, share, *space);
             let loss = optimiser.step(heads, sources, targets, &plan);
-            told.add(space.name(), step, step == steps, loss)?;
+            optimiser.check(heads, *space, step, step == steps)?;
+            if told.add(space.name(), step, step == steps, loss).is_break() {
+                return Ok(ControlFlow::Break(()));
+            }
         }
-        ControlFlow::Continue(())
+        Ok(ControlFlow::Continue(()))
     }
 }
 

@@ -33,7 +33,7 @@ fn random(seed: u64) -> (Trained, Optimiser) {
         joint: 0,
         trusts_poses: true,
         given_coverage: Some(0.25),
-        stereo_from: Some(vec![1.5e-3, -0.1, 0.0]),
+        stereo_from: Some((0..field.layout.refinement().len()).map(|n| 1.5e-3 * n as f32).collect()),
     };
     let mut trained = Trained { field, grids, progress };
     trained.visit_mut(&mut fill).expect("filling cannot fail");

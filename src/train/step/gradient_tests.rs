@@ -26,26 +26,26 @@ const ABSOLUTE: f64 = 1e-5;
 const LOOKED_AT: usize = 6;
 
 /// One chunk of a step: buffers as the kernels left them, and the gradients.
-struct Traced {
-    field: Field,
+pub(super) struct Traced {
+    pub(super) field: Field,
     pixels: PixelSet,
     config: LossConfig,
     plan: StepPlan,
     chunk: TrainChunk,
-    loss: f64,
-    dense: Vec<f32>,
-    tables: [Vec<Vec<f32>>; 3],
+    pub(super) loss: f64,
+    pub(super) dense: Vec<f32>,
+    pub(super) tables: [Vec<Vec<f32>>; 3],
 }
 
 /// A parameter.
 #[derive(Clone, Copy)]
-enum Place {
+pub(super) enum Place {
     Table(usize, usize),
     Weights,
 }
 
 /// Traces one chunk of a field whose numbers are all random, with holes in its density grids.
-fn trace(seed: u64) -> Traced {
+pub(super) fn trace(seed: u64) -> Traced {
     trace_with(seed, Precision::F32, weighed())
 }
 
@@ -177,7 +177,7 @@ impl Traced {
     }
 
     /// Calls `f` with the loss as a function of the field's numbers.
-    fn with_reference<T>(&self, f: impl FnOnce(&Reference) -> T) -> T {
+    pub(super) fn with_reference<T>(&self, f: impl FnOnce(&Reference) -> T) -> T {
         let frames = &self.pixels.frames;
         let views: Vec<View> = frames.iter().map(|f| View::new(&self.field, f)).collect();
         let times: Vec<f32> = frames.iter().map(|f| f.time as f32).collect();
@@ -256,14 +256,20 @@ fn layers(net: &Mlp, mut start: usize) -> Vec<[Range<usize>; 2]> {
         .collect()
 }
 
+fn number(x: &mut Numbers, place: Place, n: usize) -> &mut f64 {
+    match place {
+        Place::Table(s, level) => &mut x.tables[s][level][n],
+        Place::Weights => &mut x.weights[n],
+    }
+}
+
+/// Adds to one number.
+pub(super) fn add(x: &mut Numbers, place: Place, n: usize, by: f64) {
+    *number(x, place, n) += by;
+}
+
 /// Central difference of the loss by one number.
 fn difference(reference: &Reference, x: &mut Numbers, place: Place, n: usize, h: f64) -> f64 {
-    fn number(x: &mut Numbers, place: Place, n: usize) -> &mut f64 {
-        match place {
-            Place::Table(s, level) => &mut x.tables[s][level][n],
-            Place::Weights => &mut x.weights[n],
-        }
-    }
     let before = *number(x, place, n);
     *number(x, place, n) = before + h;
     let above = reference.loss(x);

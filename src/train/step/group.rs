@@ -57,6 +57,8 @@ pub struct Group {
     /// Gradient of the dense weights.
     pub dense: Vec<f32>,
     pub loss: ChunkLoss,
+    /// Number of the first chunk whose loss is not finite.
+    pub diverged: Option<usize>,
     pub evaluations: usize,
 }
 
@@ -85,14 +87,15 @@ impl Group {
     /// Evaluates the encoded samples and goes all the way back to their encodings.
     #[inline(always)]
     pub fn evaluate<S: Simd>(&mut self, simd: S, context: &Context) {
-        let Self { chunks, first, refresh, tracer, gradient, dense, loss, evaluations } = self;
+        let Self { chunks, first, refresh, tracer, gradient, dense, loss, diverged, evaluations } = self;
         dense.clear();
         dense.resize(context.model.field.layout.len, 0.0);
-        (*loss, *evaluations) = (ChunkLoss::default(), 0);
+        (*loss, *diverged, *evaluations) = (ChunkLoss::default(), None, 0);
         for (number, chunk) in (*first..).zip(chunks) {
             let l = chunk.evaluate(simd, context, tracer, gradient, number);
             loss.total += l.total;
             loss.squared += l.squared;
+            *diverged = diverged.or((!l.total.is_finite()).then_some(number));
             *evaluations += chunk.traced.batches.iter().map(StreamBatch::len).sum::<usize>();
             chunk.backward(simd, context, tracer, gradient, dense);
         }
