@@ -40,7 +40,7 @@ const QUICK: [&str; 10] = [
 
 fn kills() -> usize {
     let asked = std::env::var("DIVFF_KILLS").ok();
-    asked.map_or(20, |n| n.parse().expect("DIVFF_KILLS is a number")).div_ceil(2)
+    asked.map_or(20_u32, |n| n.parse().expect("DIVFF_KILLS is a number")).div_ceil(2)
 }
 
 fn spawn(arguments: &[String]) -> Child {

@@ -23,6 +23,8 @@ pub struct PixelSet {
     pub moving: Volume,
     /// Indices of usable pixels where a frame has a mask.
     usable: Vec<Option<Vec<u32>>>,
+    /// Half-way to the frames before and after each frame.
+    spans: Vec<[f64; 2]>,
     cameras: Vec<(Camera, PixelDirections)>,
     camera_of: Vec<usize>,
 }
@@ -53,12 +55,22 @@ impl PixelSet {
                 })
             })
             .collect();
-        Ok(Self { frames, images, stereo: Vec::new(), moving: Volume::default(), usable, cameras, camera_of })
+        let spans = spans(&frames);
+        let (stereo, moving) = (Vec::new(), Volume::default());
+        Ok(Self { frames, images, stereo, moving, usable, spans, cameras, camera_of })
     }
 
     /// Directions of all pixels of frame `n` in camera axes.
     pub fn directions(&self, n: usize) -> &[glam::Vec3] {
         &self.cameras[self.camera_of[n]].1
+    }
+
+    /// A time near that of frame `n`: from half-way to the frame before it (`u` = 0) to half-way to the one after it
+    /// (`u` = 1), with the differences times `spread`.
+    pub fn time_near(&self, n: usize, spread: f32, u: f32) -> f32 {
+        let [from, to] = self.spans[n];
+        let time = self.frames[n].time;
+        (time + f64::from(spread) * (from + f64::from(u) * (to - from) - time)) as f32
     }
 
     /// Finds the depth of the frames by stereo, from where the field says that they are; in units.
@@ -153,6 +165,35 @@ impl PixelSet {
             None => Some(((u * self.images[n].len() as f32) as usize).min(self.images[n].len() - 1)),
             Some(list) if list.is_empty() => None,
             Some(list) => Some(list[((u * list.len() as f32) as usize).min(list.len() - 1)] as usize),
+        }
+    }
+}
+
+/// For each frame the middles between its time and the next other times before and after it; its own where there is none.
+fn spans(frames: &[Frame]) -> Vec<[f64; 2]> {
+    let mut times: Vec<f64> = frames.iter().map(|f| f.time).collect();
+    times.sort_by(f64::total_cmp);
+    times.dedup();
+    let span = |frame: &Frame| {
+        let after = times.partition_point(|t| *t <= frame.time);
+        let before = times.partition_point(|t| *t < frame.time);
+        let middle = |other: Option<&f64>| other.map_or(frame.time, |t| 0.5 * (t + frame.time));
+        [middle(before.checked_sub(1).and_then(|n| times.get(n))), middle(times.get(after))]
+    };
+    frames.iter().map(span).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::testing::frame;
+
+    #[test]
+    fn frames_span_the_time_to_half_way_between_them() {
+        let frames: Vec<Frame> = [0.5, 0.0, 0.1, 0.1, 0.9].map(frame).into();
+        let expected = [[0.3, 0.7], [0.0, 0.05], [0.05, 0.3], [0.05, 0.3], [0.7, 0.9]];
+        for (span, expected) in spans(&frames).iter().zip(expected) {
+            assert!((0..2).all(|k| (span[k] - expected[k]).abs() < 1e-12), "{span:?}");
         }
     }
 }

@@ -32,6 +32,7 @@ impl TrainConfig {
                 explore: self.explore[0] + (self.explore[1] - self.explore[0]) * settled,
                 sharpness: self.sharpness,
             },
+            time_spread: self.time_spread,
             table_rate: self.table_rate * rate,
             network_rate: self.network_rate * rate,
             exposure_rate: self.exposure_rate * rate,

@@ -20,6 +20,7 @@ use crate::field::stream::LevelTask;
 use crate::render::forward::{Chunk, Grids, Model};
 use crate::render::rays::View;
 use crate::render::sampler::Sampling;
+use crate::rng::Rng;
 
 #[cfg(test)]
 mod gradient_tests;
@@ -36,6 +37,9 @@ const GROUPS: usize = 16;
 /// Rays whose activations are kept together: 32 × 24 samples are 1.2 MB, within one core's L2.
 pub const CHUNK_RAYS: usize = 32;
 
+/// Random numbers from here down are those of the frames' times.
+const TIMES: u64 = u64::MAX / 2;
+
 /// What changes from step to step.
 #[derive(Clone, Copy, Debug)]
 pub struct StepPlan {
@@ -49,6 +53,8 @@ pub struct StepPlan {
     pub grid_rate: f32,
     /// Where samples go.
     pub sampling: Sampling,
+    /// See [`crate::train::TrainConfig::time_spread`].
+    pub time_spread: f32,
     /// Learning rate of the tables.
     pub table_rate: f32,
     /// Learning rate of networks and codes.
@@ -141,7 +147,11 @@ impl Optimiser {
     ) -> StepReport {
         let chunks = chunks(plan.rays) / GROUPS;
         let rays = chunks * CHUNK_RAYS * GROUPS;
-        let views: Vec<View> = pixels.frames.iter().map(|f| View::new(field, f)).collect();
+        let mut views: Vec<View> = pixels.frames.iter().map(|f| View::new(field, f)).collect();
+        for (n, view) in views.iter_mut().enumerate() {
+            let mut rng = Rng::new(seed, plan.step, TIMES - n as u64);
+            view.time = pixels.time_near(n, plan.time_spread, rng.uniform());
+        }
         let model = Model::with_precision(field, grids, plan.streams, plan.precision);
         let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays, companion };
         let arch = pulp::Arch::new();

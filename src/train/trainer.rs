@@ -56,7 +56,7 @@ const MOVING_SHARE: f64 = 0.03;
 const JUDGED_FRAMES: usize = 12;
 
 /// Share of their pixels of which stereo finds the depth, from where poses need no refinement.
-const WELL_POSED: f64 = 0.3;
+const WELL_POSED: f64 = 0.2;
 
 /// What the caller hears while training goes on; a line of a run's `log.jsonl`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -364,7 +364,7 @@ impl Trainer {
         let Trained { field, progress, .. } = &mut self.trained;
         let refined = self.pixels.stereo_coverage(field, &judged, &self.config.stereo);
         if refined < given {
-            let refinement = field.layout.pose.start..field.layout.rig.end;
+            let refinement = field.layout.refinement();
             field.weights[refinement].fill(0.0);
             progress.trusts_poses = true;
         }
