@@ -54,7 +54,9 @@ fn poses_of_stereo_that_are_not_as_many_as_the_frames() {
 
 #[test]
 fn a_checkpoint_whose_settings_are_out_of_range_is_named() {
-    refused(&checkpoint(), |run| edit_header(run, |h| h["shape"]["config"]["persistent"]["levels"] = json!(99)));
+    refused(&checkpoint(), |run| {
+        edit_header(run, |h| h["shape"]["config"]["persistent"]["levels"] = json!(99))
+    });
 }
 
 #[test]
