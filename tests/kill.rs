@@ -40,7 +40,8 @@ const QUICK: [&str; 10] = [
 
 fn kills() -> usize {
     let asked = std::env::var("DIVFF_KILLS").ok();
-    asked.map_or(20_u32, |n| n.parse().expect("DIVFF_KILLS is a number")).div_ceil(2)
+    let count: usize = asked.map_or(20_usize, |n| n.parse().expect("DIVFF_KILLS is a number"));
+    count.div_ceil(2)
 }
 
 fn spawn(arguments: &[String]) -> Child {

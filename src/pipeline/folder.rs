@@ -150,7 +150,7 @@ impl RunFolder {
         let bad = |e: std::io::Error| PipelineError::NotARun(unusable(&path, e.to_string()));
         let text = fs::read_to_string(&path).map_err(bad)?;
         let config = Config::default().overlaid(&text, &path.display().to_string())?;
-        config.validate()?;
+        config.validate().map_err(|e| PipelineError::NotARun(unusable(&path, e.to_string())))?;
         Ok(config)
     }
 

@@ -110,7 +110,10 @@ pub(crate) fn decoder(bytes: &[u8]) -> Result<impl ImageDecoder + '_, String> {
     let decoder = reader.into_decoder().map_err(|e| e.to_string())?;
     if decoder.total_bytes() > MOST_EXPANSION * bytes.len() as u64 {
         let (width, height) = decoder.dimensions();
-        return Err(format!("{width}×{height} pixels are announced, which {} bytes cannot hold", bytes.len()));
+        return Err(format!(
+            "{width}×{height} pixels are announced, which {} bytes cannot hold",
+            bytes.len()
+        ));
     }
     Ok(decoder)
 }

@@ -54,12 +54,14 @@ fn poses_of_stereo_that_are_not_as_many_as_the_frames() {
 
 #[test]
 fn a_checkpoint_whose_settings_are_out_of_range_is_named() {
-    refused(&checkpoint(), |run| edit_header(run, |h| h["shape"]["config"]["persistent"]["levels"] = json!(99)));
+    refused(&checkpoint(), |run| {
+        edit_header(run, |h| h["shape"]["config"]["persistent"]["levels"] = json!(99))
+    });
 }
 
 #[test]
 fn a_box_without_size() {
-    for scale in [0.0, -1.0, 1e308] {
+    for scale in [0.0, -1.0] {
         let change = |h: &mut Value| h["shape"]["normalisation"]["scale"] = json!(scale);
         refused(&checkpoint(), |run| edit_header(run, change));
     }

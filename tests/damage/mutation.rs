@@ -55,7 +55,8 @@ fn damage(out: &mut Vec<u8>, rng: &mut Rng) {
         1 => out[at] = rng.next_u64() as u8,
         2 => {
             let (value, width) = (HUGE[rng.below(HUGE.len())], 1 << rng.below(4));
-            let number = if rng.below(2) == 0 { value.to_le_bytes() } else { value.rotate_left(32).to_be_bytes() };
+            let number =
+                if rng.below(2) == 0 { value.to_le_bytes() } else { value.rotate_left(32).to_be_bytes() };
             for (byte, new) in out[at..].iter_mut().zip(number).take(width) {
                 *byte = new;
             }

@@ -106,7 +106,11 @@ fn features(folder: &Path) {
     floats("dino_features/frame_000000", &[2, 3, 2]);
     floats("text/clip", &[2, 4]);
     write(folder, "text/clip.txt", "red mug\nobject\n");
-    save(folder, "hotspots/frame_000000.png", GrayImage::from_fn(12, 8, |x, _| Luma([u8::from(x < 6) * 255])));
+    save(
+        folder,
+        "hotspots/frame_000000.png",
+        GrayImage::from_fn(12, 8, |x, _| Luma([u8::from(x < 6) * 255])),
+    );
 }
 
 /// EPIC-Diff's format.

@@ -73,7 +73,12 @@ pub fn features(folder: &Path) -> Outcome {
         let features = store.frame(frame);
         if let Some(masks) = said(features.masks())? {
             let rows = masks.masks.rows();
-            assert!(masks.index.iter().all(|i| usize::from(*i) < rows || *i == divff::scene::features::Masks::NONE));
+            assert!(
+                masks
+                    .index
+                    .iter()
+                    .all(|i| usize::from(*i) < rows || *i == divff::scene::features::Masks::NONE)
+            );
         }
         for scale in features.patch_scales() {
             said(features.patches(scale))?;

@@ -112,7 +112,8 @@ fn exact(intervals: &[Interval], g: &[[f32; 3]], d_left: f32) -> Exact {
     let mut behind = left * f64::from(d_left);
     let mut gradient = vec![[0.0; 3]; n];
     for k in (0..n).rev() {
-        let shared = light[k] * delta[k] * delta[k] * slope(tau[k]) * dot(&sigma[k], &g[k]) - delta[k] * behind;
+        let shared =
+            light[k] * delta[k] * delta[k] * slope(tau[k]) * dot(&sigma[k], &g[k]) - delta[k] * behind;
         gradient[k] = g[k].map(|g| light[k] * delta[k] * phi(tau[k]) * g + shared);
         behind += dot(&weights[k], &g[k]);
     }

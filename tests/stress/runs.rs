@@ -83,9 +83,12 @@ fn identical_cameras_and_cameras_on_one_spot() {
 
 #[test]
 fn cameras_outside_the_box_and_inside_its_walls() {
-    run_edited(|list| move_cameras(list, |n, axis, x| *x += if n % 2 == 0 && axis == 0 { -3.0 } else { 0.0 }))
-        .unwrap();
-    let walls = |list: &Value, corner: usize| [0, 1, 2].map(|axis| list["aabb"][corner][axis].as_f64().unwrap());
+    run_edited(|list| {
+        move_cameras(list, |n, axis, x| *x += if n % 2 == 0 && axis == 0 { -3.0 } else { 0.0 })
+    })
+    .unwrap();
+    let walls =
+        |list: &Value, corner: usize| [0, 1, 2].map(|axis| list["aabb"][corner][axis].as_f64().unwrap());
     for corner in [0, 1] {
         let done = run_edited(|list| {
             let wall = walls(list, corner);
