@@ -151,8 +151,10 @@ pub struct Field {
     pub background: Vec3,
 }
 
-/// Width of the view encoding: spherical harmonics of degree 1 and 2.
-pub const VIEW: usize = 8;
+/// Width of the view encoding: spherical harmonics of degree 1 to 4.
+///
+/// What a glossy door mirrors changes fast with the direction; what the colours of its surface cannot say is put behind it.
+pub const VIEW: usize = 24;
 
 impl Field {
     /// An untrained field with all numbers zero; see [`Self::init`].
@@ -261,9 +263,10 @@ fn empty_tables(net: &StreamNet) -> Vec<Vec<Row>> {
     net.grid.levels.iter().map(|l| vec![Row::ZERO; l.rows]).collect()
 }
 
-/// Real spherical harmonics of degree 1 and 2 of a unit direction, without their constants' signs.
+/// Real spherical harmonics of degree 1 to 4 of a unit direction, without their constants' signs.
 pub fn view_encoding(d: Vec3) -> [f32; VIEW] {
     let Vec3 { x, y, z } = d;
+    let (xx, yy, zz) = (x * x, y * y, z * z);
     [
         0.488_602_5 * y,
         0.488_602_5 * z,
@@ -272,6 +275,22 @@ pub fn view_encoding(d: Vec3) -> [f32; VIEW] {
         1.092_548_4 * y * z,
         0.315_391_57 * (3.0 * z * z - 1.0),
         1.092_548_4 * x * z,
-        0.546_274_2 * (x * x - y * y),
+        0.546_274_2 * (xx - yy),
+        0.590_043_6 * y * (3.0 * xx - yy),
+        2.890_611_4 * x * y * z,
+        0.457_045_8 * y * (5.0 * zz - 1.0),
+        0.373_176_34 * z * (5.0 * zz - 3.0),
+        0.457_045_8 * x * (5.0 * zz - 1.0),
+        1.445_305_7 * z * (xx - yy),
+        0.590_043_6 * x * (xx - 3.0 * yy),
+        2.503_342_9 * x * y * (xx - yy),
+        1.770_130_8 * y * z * (3.0 * xx - yy),
+        0.946_174_7 * x * y * (7.0 * zz - 1.0),
+        0.669_046_5 * y * z * (7.0 * zz - 3.0),
+        0.105_785_55 * (35.0 * zz * zz - 30.0 * zz + 3.0),
+        0.669_046_5 * x * z * (7.0 * zz - 3.0),
+        0.473_087_35 * (xx - yy) * (7.0 * zz - 1.0),
+        1.770_130_8 * x * z * (xx - 3.0 * yy),
+        0.625_835_74 * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy)),
     ]
 }

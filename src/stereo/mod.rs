@@ -148,14 +148,22 @@ impl StereoDepth {
     }
 }
 
-/// Depth of every frame, up to `farthest`, continued over even surfaces; all zero for a frame that shares no view with
-/// another.
+/// Depth of every frame, up to `farthest`; all zero for a frame that shares no view with another.
 ///
-/// Deterministic, whatever the number of threads.
-pub fn depths(frames: &[StereoFrame], farthest: f32, config: &StereoConfig) -> Vec<StereoDepth> {
+/// With `continues` it is continued over even surfaces, which wants exact poses: one plane through what is wrong by some
+/// per cent is wrong everywhere. Deterministic, whatever the number of threads.
+pub fn depths(
+    frames: &[StereoFrame],
+    farthest: f32,
+    continues: bool,
+    config: &StereoConfig,
+) -> Vec<StereoDepth> {
     let rig = Rig::new(frames, farthest, config);
     let all: Vec<usize> = (0..frames.len()).collect();
     let known = rig.matched(&all);
+    if !continues {
+        return all.into_iter().zip(known).map(|(n, known)| rig.depth(n, known)).collect();
+    }
     let views = &rig.views;
     let continued: Vec<Vec<f32>> =
         all.par_iter().map(|n| fill::continued(&views[*n], *n, &known[*n])).collect();

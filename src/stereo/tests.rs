@@ -39,7 +39,7 @@ fn look(camera: &Camera, poses: &[DAffine3], plain: bool) -> Vec<StereoDepth> {
     let pictures: Vec<_> = poses.iter().map(|p| picture(camera, p, plain)).collect();
     let frames: Vec<StereoFrame> =
         poses.iter().zip(&pictures).map(|(c2w, rgb)| StereoFrame { camera, c2w: *c2w, rgb }).collect();
-    depths(&frames, 5.0, &StereoConfig::default())
+    depths(&frames, 5.0, false, &StereoConfig::default())
 }
 
 #[test]
@@ -80,7 +80,7 @@ fn nothing_is_claimed_where_nothing_can_be_known() {
             assert!(found.coverage() < 0.02, "{}", found.coverage());
         }
     }
-    assert!(depths(&[], 5.0, &StereoConfig::default()).is_empty());
+    assert!(depths(&[], 5.0, true, &StereoConfig::default()).is_empty());
 }
 
 #[test]

@@ -73,11 +73,12 @@ impl PixelSet {
         (time + f64::from(spread) * (from + f64::from(u) * (to - from) - time)) as f32
     }
 
-    /// Finds the depth of the frames by stereo, from where the field says that they are; in units.
-    pub fn look_at_depth(&mut self, field: &Field, config: &StereoConfig) {
+    /// Finds the depth of the frames by stereo, from where the field says that they are, in units; `exact` if that is where
+    /// they are.
+    pub fn look_at_depth(&mut self, field: &Field, exact: bool, config: &StereoConfig) {
         let cameras = self.refined_cameras(field);
         let farthest = field.normalisation.extent.length();
-        self.stereo = stereo::depths(&self.stereo_frames(&cameras), farthest, config);
+        self.stereo = stereo::depths(&self.stereo_frames(&cameras), farthest, exact, config);
         for (depth, frame) in self.stereo.iter_mut().zip(&self.frames) {
             // Asked by the directions that the scene's own intrinsics give.
             depth.refine(View::new(field, frame).lens);

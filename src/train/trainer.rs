@@ -347,7 +347,7 @@ impl Trainer {
         let now = field.weights[refinement.clone()].to_vec();
         let then = progress.stereo_from.get_or_insert_with(|| now.clone());
         field.weights[refinement.clone()].copy_from_slice(then);
-        self.pixels.look_at_depth(field, &self.config.stereo);
+        self.pixels.look_at_depth(field, progress.trusts_poses, &self.config.stereo);
         if field.shape.streams[Stream::Dynamic as usize] && self.config.loss.moving > 0.0 {
             self.pixels.look_for_movement(field, self.masks.take().as_ref());
         }

@@ -271,19 +271,37 @@ pub fn network(net: &Mlp, params: &[f64], mut x: Vec<f64>) -> Vec<f64> {
     x
 }
 
-/// Real spherical harmonics of degree 1 and 2, from their constants.
+/// Real spherical harmonics of degree 1 to 4 by their definition: associated Legendre functions of the polar angle times
+/// sines and cosines of the azimuth, from order −l to l, without the Condon–Shortley sign.
 fn harmonics(d: DVec3) -> [f64; VIEW] {
-    use std::f64::consts::PI;
-    let one = (3.0 / (4.0 * PI)).sqrt();
-    let two = (15.0 / (4.0 * PI)).sqrt();
-    [
-        one * d.y,
-        one * d.z,
-        one * d.x,
-        two * d.x * d.y,
-        two * d.y * d.z,
-        (5.0 / (16.0 * PI)).sqrt() * (3.0 * d.z * d.z - 1.0),
-        two * d.x * d.z,
-        0.5 * two * (d.x * d.x - d.y * d.y),
-    ]
+    let azimuth = d.y.atan2(d.x);
+    let mut out = [0.0; VIEW];
+    let mut n = 0;
+    for l in 1..=4i32 {
+        for m in -l..=l {
+            let order = m.abs();
+            let factorial = |k: i32| (1..=k).map(f64::from).product::<f64>();
+            let norm = f64::from(2 * l + 1) / (4.0 * std::f64::consts::PI) * factorial(l - order)
+                / factorial(l + order);
+            let turn = match m {
+                0 => 1.0,
+                _ if m > 0 => std::f64::consts::SQRT_2 * (f64::from(order) * azimuth).cos(),
+                _ => std::f64::consts::SQRT_2 * (f64::from(order) * azimuth).sin(),
+            };
+            out[n] = norm.sqrt() * legendre(l, order, d.z) * turn;
+            n += 1;
+        }
+    }
+    out
+}
+
+/// The associated Legendre function of degree `l` and order `m`, by recurrence in the degree.
+fn legendre(l: i32, m: i32, z: f64) -> f64 {
+    let odd = (1..=m).map(|k| f64::from(2 * k - 1)).product::<f64>();
+    let (mut below, mut value) = (0.0, odd * (1.0 - z * z).max(0.0).sqrt().powi(m));
+    for k in m + 1..=l {
+        let next = (f64::from(2 * k - 1) * z * value - f64::from(k + m - 1) * below) / f64::from(k - m);
+        (below, value) = (value, next);
+    }
+    value
 }
