@@ -180,7 +180,8 @@ mod tests {
     #[test]
     fn a_door_is_one_region() {
         let regions = regions(&picture(), WIDTH);
-        let of_door = regions.iter().find(|r| r.contains(&(10 * WIDTH + 12))).expect("every pixel has a region");
+        let of_door =
+            regions.iter().find(|r| r.contains(&(10 * WIDTH + 12))).expect("every pixel has a region");
         assert_eq!(of_door.len(), 16 * 16);
         assert!(of_door.iter().all(|n| door(*n)));
         assert_eq!(regions.iter().map(Vec::len).sum::<usize>(), WIDTH * HEIGHT);

@@ -19,8 +19,8 @@ use glam::{DAffine3, Vec2, Vec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use self::rig::WorkView;
 pub use self::plane::{Plane, Point};
+use self::rig::WorkView;
 pub use self::see_through::{SeenFrame, seen_through};
 use crate::config::ConfigError;
 use crate::scene::Camera;

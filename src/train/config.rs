@@ -35,6 +35,8 @@ pub struct TrainConfig {
     pub streams: StreamChoice,
     /// Fraction of the schedule that trains the persistent stream alone.
     pub static_until: f64,
+    /// Share of the rays that go where few frames look; the others are drawn evenly from all pixels.
+    pub novelty: f64,
     /// How far from its own time a frame teaches what moves, as a share of the way to the middle between its neighbours
     /// and it: what is between two frames is then as in the nearer one, and not what nobody has looked at.
     pub time_spread: f32,
@@ -82,6 +84,7 @@ impl Default for TrainConfig {
             render_samples: 48,
             streams: StreamChoice::Auto,
             static_until: 0.15,
+            novelty: 0.5,
             time_spread: 1.0,
             table_rate: 3e-2,
             network_rate: 2e-3,

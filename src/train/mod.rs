@@ -7,6 +7,7 @@ mod config;
 mod error;
 pub mod loss;
 mod moving;
+mod novelty;
 pub mod pixels;
 mod schedule;
 mod session;

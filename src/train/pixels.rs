@@ -5,9 +5,11 @@ use rayon::prelude::*;
 
 use super::moving::masks::FrameMasks;
 use super::moving::{self, Evidence, Volume};
+use super::novelty::Novelty;
 use crate::field::Field;
 use crate::render::rays::{PixelDirections, View, pixel_directions};
 use crate::render::refined::refined_camera;
+use crate::rng::Rng;
 use crate::scene::{Camera, Frame, SceneError};
 use crate::stereo::{self, SeenFrame, StereoConfig, StereoDepth, StereoFrame};
 
@@ -23,6 +25,8 @@ pub struct PixelSet {
     pub moving: Volume,
     /// Indices of usable pixels where a frame has a mask.
     usable: Vec<Option<Vec<u32>>>,
+    /// Where rays go.
+    novelty: Novelty,
     /// Half-way to the frames before and after each frame.
     spans: Vec<[f64; 2]>,
     cameras: Vec<(Camera, PixelDirections)>,
@@ -30,11 +34,12 @@ pub struct PixelSet {
 }
 
 impl PixelSet {
-    /// Loads all pixels and masks of `frames`.
+    /// Loads all pixels and masks of `frames`; `novelty` of the rays go where few frames look, in a scene of some `size`
+    /// (world units).
     ///
     /// # Errors
     /// A file that cannot be read or does not fit its frame.
-    pub fn load(frames: Vec<Frame>) -> Result<Self, SceneError> {
+    pub fn load(frames: Vec<Frame>, size: f64, novelty: f64) -> Result<Self, SceneError> {
         let loaded: Vec<_> = frames
             .par_iter()
             .map(|f| {
@@ -55,9 +60,9 @@ impl PixelSet {
                 })
             })
             .collect();
-        let spans = spans(&frames);
+        let (spans, novelty) = (spans(&frames), Novelty::new(&frames, size, novelty));
         let (stereo, moving) = (Vec::new(), Volume::default());
-        Ok(Self { frames, images, stereo, moving, usable, spans, cameras, camera_of })
+        Ok(Self { frames, images, stereo, moving, usable, novelty, spans, cameras, camera_of })
     }
 
     /// Directions of all pixels of frame `n` in camera axes.
@@ -160,12 +165,18 @@ impl PixelSet {
         self.usable[n].as_ref().is_none_or(|list| list.binary_search(&pixel).is_ok())
     }
 
-    /// A usable pixel of frame `n`, chosen by `u` in [0, 1); `None` where the mask leaves none.
-    pub fn pick(&self, n: usize, u: f32) -> Option<usize> {
-        match &self.usable[n] {
-            None => Some(((u * self.images[n].len() as f32) as usize).min(self.images[n].len() - 1)),
-            Some(list) if list.is_empty() => None,
-            Some(list) => Some(list[((u * list.len() as f32) as usize).min(list.len() - 1)] as usize),
+    /// Whether any frame has a usable pixel.
+    pub fn has_usable(&self) -> bool {
+        self.usable.iter().any(|list| list.as_ref().is_none_or(|list| !list.is_empty()))
+    }
+
+    /// Number of a frame and a usable pixel of it. There must be one.
+    pub fn draw(&self, rng: &mut Rng) -> (usize, usize) {
+        loop {
+            let (frame, pixel) = self.novelty.draw(&self.frames, rng);
+            if self.is_usable(frame, pixel as u32) {
+                return (frame, pixel);
+            }
         }
     }
 }

@@ -112,7 +112,7 @@ impl Trainer {
     /// A setting that is out of range, or a frame that cannot be read.
     pub fn new(scene: &Scene, config: &Config) -> Result<Self, TrainError> {
         config.validate()?;
-        let (pixels, test) = load(scene)?;
+        let (pixels, test) = load(scene, config)?;
         let masks = load_masks(scene, config, &pixels)?;
         let all = config.train.streams != StreamChoice::Static;
         let shape = FieldShape {
@@ -145,7 +145,7 @@ impl Trainer {
     pub fn resume(scene: &Scene, config: &Config, run: &Path) -> Result<Self, TrainError> {
         config.validate()?;
         let (trained, optimiser) = Trained::resume(run)?;
-        let (pixels, test) = load(scene)?;
+        let (pixels, test) = load(scene, config)?;
         let masks = load_masks(scene, config, &pixels)?;
         let streams = match trained.progress.streams_settled {
             true => trained.field.shape.streams,
@@ -448,14 +448,16 @@ impl Trainer {
     }
 }
 
-fn load(scene: &Scene) -> Result<(PixelSet, PixelSet), TrainError> {
+fn load(scene: &Scene, config: &Config) -> Result<(PixelSet, PixelSet), TrainError> {
     let of =
         |split: Split| -> Vec<Frame> { scene.frames.iter().filter(|f| f.split == split).cloned().collect() };
-    let pixels = PixelSet::load(of(Split::Train))?;
-    if (0..pixels.frames.len()).all(|n| pixels.pick(n, 0.0).is_none()) {
+    let size = (scene.bounds.max - scene.bounds.min).length();
+    let load = |split| PixelSet::load(of(split), size, config.train.novelty);
+    let pixels = load(Split::Train)?;
+    if !pixels.has_usable() {
         return Err(TrainError::NoPixels);
     }
-    Ok((pixels, PixelSet::load(of(Split::Test))?))
+    Ok((pixels, load(Split::Test)?))
 }
 
 /// The masks that tell what moves, where that is asked.

@@ -74,7 +74,8 @@ fn seeds() -> impl Iterator<Item = u64> {
 
 fn trace_with(seed: u64, precision: Precision, config: LossConfig) -> Traced {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let mut pixels = PixelSet::load(testing::frames(folder.path())).expect("frames that were just written");
+    let mut pixels =
+        PixelSet::load(testing::frames(folder.path()), 2.0, 0.5).expect("frames that were just written");
     let settings = testing::config();
     let mut field = Field::zeros(testing::shape(&settings));
     field.init(seed);

@@ -134,7 +134,7 @@ impl TrainChunk {
         let pixels = context.pixels;
         let side = context.plan.patch;
         let mut rng = Rng::new(context.seed, context.plan.step, chunk as u64);
-        let mut corner = (0, 0, 1);
+        let mut middle = (0, 0, 1);
         let given = context.companion.map(|c| c.rays(chunk));
         for k in 0..CHUNK_RAYS {
             if let Some(rays) = &given {
@@ -144,18 +144,15 @@ impl TrainChunk {
             }
             let in_patch = k as u32 % (side * side);
             if in_patch == 0 {
-                corner = loop {
-                    let frame = rng.below(pixels.frames.len());
-                    if let Some(pixel) = pixels.pick(frame, rng.uniform()) {
-                        break (frame, pixel, 1u32 << rng.below(PATCH_STRIDES));
-                    }
-                };
+                let (frame, pixel) = pixels.draw(&mut rng);
+                middle = (frame, pixel, 1u32 << rng.below(PATCH_STRIDES));
             }
-            let (frame, first, stride) = corner;
+            let (frame, first, stride) = middle;
             let camera = &pixels.frames[frame].camera;
             // A patch that sticks out is moved back into the picture, as far as it fits.
-            let along = |first: u32, size: u32, n: u32| {
-                let start = first.min(size.saturating_sub((side - 1) * stride + 1));
+            let along = |middle: u32, size: u32, n: u32| {
+                let start = middle.saturating_sub((side - 1) * stride / 2);
+                let start = start.min(size.saturating_sub((side - 1) * stride + 1));
                 (start + n * stride).min(size - 1)
             };
             let x = along(first as u32 % camera.width, camera.width, in_patch % side);
