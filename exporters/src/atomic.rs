@@ -1,25 +1,31 @@
 //! Files that are either complete or not there: the one way in which anything is written.
 
-use std::fs::{self, File, OpenOptions};
+mod disk;
+#[cfg(test)]
+pub(crate) mod faults;
+
+use std::fs;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
+pub use disk::TempFile;
+
 use crate::error::{Error, Result};
 
 /// What a writing closure gets: buffered, and seekable for formats that fill in tables afterwards.
-pub type AtomicWriter = BufWriter<File>;
+pub type AtomicWriter = BufWriter<TempFile>;
 
 /// Writers hand over whole columns or chunks of rows; this only gathers headers and other small pieces.
 const BUFFER_BYTES: usize = 64 * 1024;
 
 /// Removes the temporary file unless it was renamed, also when the closure panics.
-struct TempFile {
+struct Cleanup {
     path: PathBuf,
     armed: bool,
 }
 
-impl Drop for TempFile {
+impl Drop for Cleanup {
     fn drop(&mut self) {
         if self.armed {
             // Nothing sensible can be done about a failure here; the write's own error is the one to report.
@@ -35,7 +41,8 @@ impl Drop for TempFile {
 ///
 /// # Errors
 /// `Io` when the folder is missing or unwritable, the disk is full, or `write` fails. The temporary file is
-/// then gone and an older `path` is untouched.
+/// then gone and an older `path` is untouched; only when nothing but syncing the folder failed, the whole new file
+/// is there already.
 pub fn write_atomically(path: &Path, write: impl FnOnce(&mut AtomicWriter) -> io::Result<()>) -> Result<()> {
     write_and_replace(path, write).map_err(|source| Error::io(path, source))
 }
@@ -49,22 +56,22 @@ pub fn write_bytes_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
 }
 
 fn write_and_replace(path: &Path, write: impl FnOnce(&mut AtomicWriter) -> io::Result<()>) -> io::Result<()> {
-    let (file, mut temp) = create_temp_beside(path)?;
+    let (file, mut cleanup) = create_temp_beside(path)?;
     let mut writer = BufWriter::with_capacity(BUFFER_BYTES, file);
     write(&mut writer)?;
     let file = writer.into_inner().map_err(io::IntoInnerError::into_error)?;
-    file.sync_all()?;
+    file.sync()?;
     drop(file);
-    fs::rename(&temp.path, path)?;
-    temp.armed = false;
-    sync_folder(folder_of(path))
+    disk::rename(&cleanup.path, path)?;
+    cleanup.armed = false;
+    disk::sync_folder(folder_of(path), path)
 }
 
 /// Creates `.<name>.<process>-<counter>.tmp`.
 ///
 /// The process id and the counter keep apart the writers of one machine; `create_new` those of several
 /// machines or containers that share the folder and happen to have the same process id.
-fn create_temp_beside(path: &Path) -> io::Result<(File, TempFile)> {
+fn create_temp_beside(path: &Path) -> io::Result<(TempFile, Cleanup)> {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     let Some(name) = path.file_name() else {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "the path does not name a file"));
@@ -75,8 +82,8 @@ fn create_temp_beside(path: &Path) -> io::Result<(File, TempFile)> {
         temp_name.push(name);
         temp_name.push(format!(".{}-{counter}.tmp", std::process::id()));
         let temp_path = folder_of(path).join(temp_name);
-        match OpenOptions::new().write(true).create_new(true).open(&temp_path) {
-            Ok(file) => return Ok((file, TempFile { path: temp_path, armed: true })),
+        match TempFile::create(&temp_path, path) {
+            Ok(file) => return Ok((file, Cleanup { path: temp_path, armed: true })),
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
             Err(error) => return Err(error),
         }
@@ -90,13 +97,10 @@ fn folder_of(path: &Path) -> &Path {
     }
 }
 
-/// Makes the rename durable. Only Unix lets a folder be opened and synced.
-fn sync_folder(folder: &Path) -> io::Result<()> {
-    if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
+
     use super::*;
 
     fn names_in(folder: &Path) -> Vec<String> {

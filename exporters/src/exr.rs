@@ -3,16 +3,23 @@
 //! One unnamed part, scan lines in increasing Y, ZIP over blocks of 16 lines. Channel names are the caller's:
 //! `R G B`, `depth.Z`, `relevancy_<slug>.Y`, `clip_000.R` … (`docs/formats.md`).
 
+mod blocks;
+
 use std::fs::File;
 use std::io::{self, BufReader};
 use std::path::Path;
 
+use exr::block::chunk::{Chunk, CompressedBlock, CompressedScanLineBlock};
+use exr::block::writer::ChunksWriter;
 use exr::prelude as x;
 use exr::prelude::{ReadChannels, ReadLayers, WritableImage};
 use half::f16;
+use rayon::prelude::*;
 
-use crate::atomic::write_atomically;
+use self::blocks::{BLOCK_LINES, compressed_block};
+use crate::atomic::{AtomicWriter, write_atomically};
 use crate::error::{Error, Result};
+use crate::validate::{first_non_finite, position_of_first};
 
 /// Values of one channel, row by row from the top.
 #[derive(Clone, Debug, PartialEq)]
@@ -89,11 +96,9 @@ impl ExrChannel {
     fn check_finite(&self, object: &str) -> Result<()> {
         let bad = match &self.samples {
             ExrSamples::F16(values) => {
-                values.iter().position(|v| !v.is_finite()).map(|row| (row, values[row].to_f64()))
+                position_of_first(values, |v| !v.is_finite()).map(|row| (row, values[row].to_f64()))
             }
-            ExrSamples::F32(values) => {
-                crate::validate::first_non_finite(values).map(|row| (row, f64::from(values[row])))
-            }
+            ExrSamples::F32(values) => first_non_finite(values).map(|row| (row, f64::from(values[row]))),
         };
         match bad {
             Some((row, value)) => {
@@ -132,7 +137,39 @@ pub fn write_exr(path: &Path, image: ExrImage) -> Result<()> {
     // Default attributes: a part with a name would make Blender turn every channel group into a layer.
     let picture =
         x::Image::from_layer(x::Layer::new(size, x::LayerAttributes::default(), encoding, channels));
-    write_atomically(path, |file| picture.write().to_buffered(file).map_err(io::Error::other))
+    write_atomically(path, |file| {
+        write_blocks(file, &picture).map_err(|error| match error {
+            exr::error::Error::Io(source) => source,
+            other => io::Error::other(other),
+        })
+    })
+}
+
+type Picture = x::Image<x::Layer<x::AnyChannels<x::FlatSamples>>>;
+
+/// Compresses blocks on all cores, some for each at a time, and writes them in order.
+fn write_blocks(file: &mut AtomicWriter, picture: &Picture) -> exr::error::UnitResult {
+    let layer = &picture.layer_data;
+    let channels: Vec<_> = layer.channel_data.list.iter().map(|channel| &channel.sample_data).collect();
+    let (width, height) = (layer.size.width(), layer.size.height());
+    let block_count = height.div_ceil(BLOCK_LINES);
+    let at_once = 4 * rayon::current_num_threads();
+    exr::block::write(file, picture.write().infer_meta_data(), true, |_, writer| {
+        for first in (0..block_count).step_by(at_once) {
+            let blocks: Vec<Vec<u8>> = (first..(first + at_once).min(block_count))
+                .into_par_iter()
+                .map(|block| compressed_block(&channels, width, height, block * BLOCK_LINES))
+                .collect();
+            for (index, compressed_pixels_le) in (first..).zip(blocks) {
+                // MAX_SIDE is far below what an i32 holds.
+                let y_coordinate = (index * BLOCK_LINES) as i32;
+                let block = CompressedScanLineBlock { y_coordinate, compressed_pixels_le };
+                let chunk = Chunk { layer_index: 0, compressed_block: CompressedBlock::ScanLine(block) };
+                writer.write_chunk(index, chunk)?;
+            }
+        }
+        Ok(())
+    })
 }
 
 /// Reads the first part of a scan-line or tiled file; channels come in the order of their names.
@@ -172,7 +209,10 @@ pub fn read_exr(path: &Path) -> Result<ExrImage> {
 
 fn exr_error(path: &Path, error: exr::error::Error) -> Error {
     match error {
-        exr::error::Error::Io(source) if source.kind() != io::ErrorKind::UnexpectedEof => {
+        // A damaged offset leads behind the end of the file, or before its beginning.
+        exr::error::Error::Io(source)
+            if !matches!(source.kind(), io::ErrorKind::UnexpectedEof | io::ErrorKind::InvalidInput) =>
+        {
             Error::io(path, source)
         }
         exr::error::Error::NotSupported(what) => Error::Unsupported {

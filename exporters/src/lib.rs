@@ -13,12 +13,17 @@ pub mod atomic;
 mod axes;
 pub mod error;
 pub mod exr;
+#[cfg(test)]
+mod fault_tests;
 pub mod geometry;
 pub mod glb;
 pub mod manifest;
 pub mod npy;
 pub mod npz;
 pub mod ply;
+#[cfg(test)]
+mod property_tests;
+mod rows;
 #[cfg(test)]
 mod samples;
 mod validate;

@@ -11,6 +11,7 @@ use half::f16;
 
 use crate::atomic::write_atomically;
 use crate::error::{Error, Result};
+use crate::rows::write_words;
 
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 
@@ -170,14 +171,14 @@ pub fn write_npy_i32(path: &Path, shape: &[usize], values: &[i32]) -> Result<()>
     write_array(path, NpyHeader { dtype: Dtype::I32, shape: shape.to_vec() }, bytemuck::cast_slice(values))
 }
 
-fn write_array(path: &Path, header: NpyHeader, values: &[u8]) -> Result<()> {
-    if header.bytes() != Some(values.len()) {
-        let reason = format!("{} bytes do not make an array of {:?}", values.len(), header.shape);
+fn write_array(path: &Path, header: NpyHeader, values: &[u32]) -> Result<()> {
+    if header.bytes() != Some(size_of_val(values)) {
+        let reason = format!("{} values do not make an array of {:?}", values.len(), header.shape);
         return Err(Error::inconsistent(&path.display().to_string(), reason));
     }
     write_atomically(path, |file| {
         file.write_all(&header_bytes(header.dtype, &header.shape))?;
-        file.write_all(values)
+        write_words(file, values)
     })
 }
 

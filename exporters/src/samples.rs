@@ -40,9 +40,13 @@ fn attribute(name: &str, values: AttributeValues) -> Attribute {
     Attribute { name: name.into(), values }
 }
 
-/// Any valid geometry of up to 40 vertices, with or without each kind of column.
+/// The extremes of each kind of float, which random bits would hardly ever hit.
+const EXTREMES: [f32; 8] = [f32::MAX, f32::MIN, f32::MIN_POSITIVE, 1e-45, -1e-45, 0.0, -0.0, 1.0];
+
+/// Any valid geometry of up to 40 vertices, or none, with or without each kind of column.
 pub(crate) fn any_geometry() -> impl Strategy<Value = Geometry> {
-    (1usize..40, 0usize..9, any::<[bool; 4]>(), any::<u64>()).prop_map(|(vertices, dim, has, seed)| {
+    let sizes = (prop_oneof![Just(0), Just(1), 2usize..40], 0usize..9);
+    (any_name(), sizes, any::<[bool; 4]>(), any::<u64>()).prop_map(|(name, (vertices, dim), has, seed)| {
         // SplitMix64: one seed keeps shrinking simple.
         let mut state = seed;
         let mut next = move || {
@@ -53,8 +57,11 @@ pub(crate) fn any_geometry() -> impl Strategy<Value = Geometry> {
             z ^ (z >> 31)
         };
         let mut float = || loop {
-            // All finite bit patterns: huge, tiny, denormal, negative zero.
-            let value = f32::from_bits(next() as u32);
+            let bits = next();
+            if bits >> 62 == 0 {
+                return EXTREMES[(bits >> 32) as usize % EXTREMES.len()];
+            }
+            let value = f32::from_bits(bits as u32);
             if value.is_finite() {
                 return value;
             }
@@ -70,20 +77,23 @@ pub(crate) fn any_geometry() -> impl Strategy<Value = Geometry> {
         let corner = |i: usize| [i as u32, ((i + 1) % vertices) as u32, ((i * 7) % vertices) as u32];
         let with = |yes: bool, n: usize| if yes { n } else { 0 };
         Geometry {
-            name: format!("dynamic_{:06}", seed % 1_000_000),
+            name,
             offset,
             normals: (0..with(has[1], vertices)).map(unit).collect(),
             colors: (0..with(has[2], vertices))
                 .map(|i| [i as u8, (seed >> 8) as u8, (i * 31) as u8])
                 .collect(),
-            triangles: (0..with(has[3], vertices)).map(corner).collect(),
+            triangles: (0..with(has[3] && vertices > 0, vertices)).map(corner).collect(),
             attributes: vec![
                 attribute("score", AttributeValues::F32(score)),
                 attribute(
                     "label",
                     AttributeValues::I32((0..vertices).map(|i| i as i32 * 1000 - 7).collect()),
                 ),
-                attribute("stream", AttributeValues::U8((0..vertices).map(|i| i as u8).collect())),
+                attribute(
+                    NAMES[seed as usize % NAMES.len()],
+                    AttributeValues::U8((0..vertices).map(|i| i as u8).collect()),
+                ),
             ],
             features: (dim > 0)
                 .then_some(Features { name: "clip_pca".into(), dim, values: features })
@@ -92,6 +102,15 @@ pub(crate) fn any_geometry() -> impl Strategy<Value = Geometry> {
             positions,
         }
     })
+}
+
+/// Names of columns at the edge of what is allowed.
+const NAMES: [&str; 6] = ["stream", "v", "a__b_", "n_00", "colours", "relevancy_the_red_cup"];
+
+/// Any text in one line.
+fn any_name() -> impl Strategy<Value = String> {
+    let characters = any::<char>().prop_filter("no control character", |c| !c.is_control());
+    prop::collection::vec(characters, 0..12).prop_map(String::from_iter)
 }
 
 /// Bit patterns of all floats, so that -0.0 and 0.0 differ.

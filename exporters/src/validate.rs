@@ -107,10 +107,11 @@ impl Geometry {
             self.check_finite(&features.name, &features.values, features.dim)?;
         }
         let not_unit = |normal: &[f32; 3]| {
-            let length = normal.iter().map(|v| v * v).sum::<f32>().sqrt();
+            let [x, y, z] = normal;
+            let length = (x * x + y * y + z * z).sqrt();
             (length - 1.0).abs() > UNIT_LENGTH_TOLERANCE
         };
-        match self.normals.par_iter().with_min_len(CHUNK).position_first(not_unit) {
+        match position_of_first(&self.normals, not_unit) {
             Some(vertex) => {
                 let reason = format!(
                     "the normal of vertex {vertex}, {:?}, is not of unit length",
@@ -135,8 +136,8 @@ impl Geometry {
 
     fn validate_triangles(&self) -> Result<()> {
         let vertices = self.positions.len();
-        let out_of_range = |triangle: &[u32; 3]| triangle.iter().any(|&v| v as usize >= vertices);
-        match self.triangles.par_iter().with_min_len(CHUNK).position_first(out_of_range) {
+        let out_of_range = |[a, b, c]: &[u32; 3]| *a.max(b).max(c) as usize >= vertices;
+        match position_of_first(&self.triangles, out_of_range) {
             Some(triangle) => {
                 let corners = self.triangles[triangle];
                 let reason = format!("triangle {triangle} is {corners:?} but there are {vertices} vertices");
@@ -172,13 +173,17 @@ impl Features {
 
 /// Index of the first NaN or infinity.
 pub(crate) fn first_non_finite(values: &[f32]) -> Option<usize> {
-    // A sum of `v * 0` over a block is zero unless one is NaN or infinite: no branches, so it vectorises.
-    let block_is_finite = |block: &[f32]| block.iter().map(|v| v * 0.0).sum::<f32>() == 0.0;
-    values.par_chunks(CHUNK).enumerate().find_map_first(|(chunk, values)| {
-        if block_is_finite(values) {
+    position_of_first(values, |value| !value.is_finite())
+}
+
+/// Index of the first item that is bad.
+pub(crate) fn position_of_first<T: Sync>(items: &[T], is_bad: impl Fn(&T) -> bool + Sync) -> Option<usize> {
+    items.par_chunks(CHUNK).enumerate().find_map_first(|(chunk, items)| {
+        // Looking at every item of a chunk vectorises, stopping at the first bad one does not.
+        if !items.iter().fold(false, |any, item| any | is_bad(item)) {
             return None;
         }
-        values.iter().position(|v| !v.is_finite()).map(|index| chunk * CHUNK + index)
+        items.iter().position(&is_bad).map(|index| chunk * CHUNK + index)
     })
 }
 

@@ -11,6 +11,7 @@ use serde_json::{Map, json};
 use super::color::linear_u16_table;
 use crate::axes::UpAxis;
 use crate::geometry::AttributeValues;
+use crate::rows::{triple_bytes, write_items, write_rows, write_words};
 
 /// A run of bytes of the binary chunk, converted while it is written. Lengths are multiples of four.
 pub(super) enum Piece<'a> {
@@ -75,8 +76,10 @@ impl Piece<'_> {
                 let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
                 for vector in *vectors {
                     let vector = up.to_gltf(*vector);
-                    low = std::array::from_fn(|i| low[i].min(vector[i]));
-                    high = std::array::from_fn(|i| high[i].max(vector[i]));
+                    for axis in 0..3 {
+                        low[axis] = low[axis].min(vector[axis]);
+                        high[axis] = high[axis].max(vector[axis]);
+                    }
                 }
                 Some((json!(low), json!(high)))
             }
@@ -85,10 +88,13 @@ impl Piece<'_> {
         }
     }
 
-    fn write(&self, file: &mut impl Write) -> io::Result<()> {
+    fn write(&self, file: &mut (impl Write + Send)) -> io::Result<()> {
         match self {
-            Self::Vectors(vectors, up) => write_items(file, vectors, |v| bytes3(up.to_gltf(*v))),
-            Self::Scales(scales) => write_items(file, scales, |v| bytes3(*v)),
+            Self::Vectors(vectors, UpAxis::Y) => write_words(file, bytemuck::cast_slice(vectors)),
+            Self::Vectors(vectors, up) => {
+                write_items(file, vectors, |v| triple_bytes(bytemuck::cast(up.to_gltf(*v))))
+            }
+            Self::Scales(scales) => write_words(file, bytemuck::cast_slice(scales)),
             Self::Colors(colors) => {
                 let linear = linear_u16_table();
                 write_items(file, colors, |color| {
@@ -103,47 +109,24 @@ impl Piece<'_> {
                     bytemuck::cast::<[u32; 4], [u8; 16]>([r, g, b, 1f32.to_bits().to_le()])
                 })
             }
-            Self::Scalars(AttributeValues::F32(values)) => write_items(file, values, |v| v.to_le_bytes()),
+            Self::Scalars(AttributeValues::F32(values)) => write_words(file, bytemuck::cast_slice(values)),
             Self::Scalars(AttributeValues::I32(values)) => {
                 write_items(file, values, |v| (*v as f32).to_le_bytes())
             }
             Self::Scalars(AttributeValues::U8(values)) => {
                 write_items(file, values, |v| f32::from(*v).to_le_bytes())
             }
-            Self::Quads { values, dim, first } => {
-                let rows: Vec<&[f32]> = values.chunks_exact(*dim).collect();
-                write_items(file, &rows, |row| {
+            Self::Quads { values, dim, first } => write_rows(file, self.count(), 16, |first_row, rows| {
+                let features = values[first_row * dim..].chunks_exact(*dim);
+                for (to, row) in rows.as_chunks_mut::<16>().0.iter_mut().zip(features) {
                     let quad: [f32; 4] = std::array::from_fn(|i| row.get(first + i).copied().unwrap_or(0.0));
-                    bytemuck::cast::<[u32; 4], [u8; 16]>(quad.map(|v| v.to_bits().to_le()))
-                })
-            }
-            Self::Indices(triangles) => {
-                write_items(file, triangles, |t| bytemuck::cast::<[u32; 3], [u8; 12]>(t.map(u32::to_le)))
-            }
-            Self::Seconds(seconds) => write_items(file, seconds, |v| v.to_le_bytes()),
+                    *to = bytemuck::cast(quad.map(|v| v.to_bits().to_le()));
+                }
+            }),
+            Self::Indices(triangles) => write_words(file, triangles.as_flattened()),
+            Self::Seconds(seconds) => write_words(file, bytemuck::cast_slice(seconds)),
         }
     }
-}
-
-fn bytes3(vector: [f32; 3]) -> [u8; 12] {
-    bytemuck::cast(vector.map(|v| v.to_bits().to_le()))
-}
-
-/// Converts items chunk by chunk, so that the file is never held in memory a second time.
-fn write_items<T, const N: usize>(
-    file: &mut impl Write,
-    items: &[T],
-    bytes: impl Fn(&T) -> [u8; N],
-) -> io::Result<()> {
-    const CHUNK: usize = 1 << 14;
-    let mut buffer = vec![[0; N]; CHUNK.min(items.len())];
-    for chunk in items.chunks(CHUNK) {
-        for (to, from) in buffer.iter_mut().zip(chunk) {
-            *to = bytes(from);
-        }
-        file.write_all(buffer[..chunk.len()].as_flattened())?;
-    }
-    Ok(())
 }
 
 /// JSON and binary pieces, growing together.
@@ -210,7 +193,7 @@ impl<'a> Document<'a> {
     }
 
     /// Streams the binary chunk's content.
-    pub(super) fn write_bin(&self, file: &mut impl Write) -> io::Result<()> {
+    pub(super) fn write_bin(&self, file: &mut (impl Write + Send)) -> io::Result<()> {
         self.pieces.iter().try_for_each(|piece| piece.write(file))
     }
 }

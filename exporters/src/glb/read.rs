@@ -277,21 +277,19 @@ impl Reader<'_> {
     /// Components per item and all values; normalised integers become 0..1 (or -1..1).
     fn floats(&self, accessor: Index<Accessor>) -> Result<(usize, Vec<f32>)> {
         let (component, width, items, normalized) = self.items(accessor)?;
-        let size = component.size();
-        let mut values = Vec::with_capacity(items.len() * width);
-        for item in items {
-            for bytes in item.chunks_exact(size) {
-                let (value, largest) = match component {
-                    ComponentType::F32 => (f32::from_le_bytes(array(bytes)), 1.0),
-                    ComponentType::U8 => (f32::from(bytes[0]), 255.0),
-                    ComponentType::I8 => (f32::from(bytes[0] as i8), 127.0),
-                    ComponentType::U16 => (f32::from(u16::from_le_bytes(array(bytes))), 65535.0),
-                    ComponentType::I16 => (f32::from(i16::from_le_bytes(array(bytes))), 32767.0),
-                    ComponentType::U32 => (u32::from_le_bytes(array(bytes)) as f32, 1.0),
-                };
-                values.push(if normalized { (value / largest).max(-1.0) } else { value });
+        let scaled = |value: f32, largest: f32| if normalized { (value / largest).max(-1.0) } else { value };
+        let values = match component {
+            ComponentType::F32 => collect(items, width, f32::from_le_bytes),
+            ComponentType::U8 => collect(items, width, |[b]| scaled(f32::from(b), 255.0)),
+            ComponentType::I8 => collect(items, width, |[b]| scaled(f32::from(b as i8), 127.0)),
+            ComponentType::U16 => {
+                collect(items, width, |b| scaled(f32::from(u16::from_le_bytes(b)), 65535.0))
             }
-        }
+            ComponentType::I16 => {
+                collect(items, width, |b| scaled(f32::from(i16::from_le_bytes(b)), 32767.0))
+            }
+            ComponentType::U32 => collect(items, width, |b| u32::from_le_bytes(b) as f32),
+        };
         Ok((width, values))
     }
 
@@ -301,9 +299,9 @@ impl Reader<'_> {
             return Err(self.invalid("indices are no scalars".into()));
         }
         match component {
-            ComponentType::U8 => Ok(items.map(|item| u32::from(item[0])).collect()),
-            ComponentType::U16 => Ok(items.map(|item| u32::from(u16::from_le_bytes(array(item)))).collect()),
-            ComponentType::U32 => Ok(items.map(|item| u32::from_le_bytes(array(item))).collect()),
+            ComponentType::U8 => Ok(collect(items, 1, |[byte]| u32::from(byte))),
+            ComponentType::U16 => Ok(collect(items, 1, |bytes| u32::from(u16::from_le_bytes(bytes)))),
+            ComponentType::U32 => Ok(collect(items, 1, u32::from_le_bytes)),
             _ => Err(self.invalid("indices are not unsigned integers".into())),
         }
     }
@@ -366,9 +364,19 @@ impl Reader<'_> {
     }
 }
 
-/// The first `N` bytes of a slice that is at least so long (chunks of the component's size).
-fn array<const N: usize>(bytes: &[u8]) -> [u8; N] {
-    std::array::from_fn(|i| bytes[i])
+/// All values of items that are `width` values of `N` bytes each.
+fn collect<'a, T, const N: usize>(
+    items: impl ExactSizeIterator<Item = &'a [u8]>,
+    width: usize,
+    convert: impl Fn([u8; N]) -> T,
+) -> Vec<T> {
+    let mut values = Vec::with_capacity(items.len() * width);
+    for item in items {
+        for bytes in item.as_chunks::<N>().0 {
+            values.push(convert(*bytes));
+        }
+    }
+    values
 }
 
 fn extras_map(extras: &gltf_json::Extras) -> Map<String, Value> {

@@ -10,6 +10,7 @@ use crate::atomic::{AtomicWriter, write_atomically};
 use crate::error::{Error, Result};
 use crate::geometry::{AttributeValues, Geometry};
 use crate::npy::{self, Dtype};
+use crate::rows::write_words;
 
 /// How the arrays are stored.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -78,7 +79,7 @@ impl Archive<'_> {
             match &attribute.values {
                 AttributeValues::F32(values) => self.floats(&attribute.name, 1, values)?,
                 AttributeValues::I32(values) => {
-                    self.array(&attribute.name, Dtype::I32, 1, values, |v| v.to_le_bytes())?;
+                    self.words(&attribute.name, Dtype::I32, 1, bytemuck::cast_slice(values))?;
                 }
                 AttributeValues::U8(values) => self.bytes(&attribute.name, 1, values)?,
             }
@@ -88,31 +89,30 @@ impl Archive<'_> {
         }
         if !geometry.triangles.is_empty() {
             // Signed, as Open3D wants it; validate() keeps indices below the vertex count.
-            let corners = geometry.triangles.as_flattened();
-            self.array("triangles", Dtype::I32, 3, corners, |v| v.to_le_bytes())?;
+            self.words("triangles", Dtype::I32, 3, geometry.triangles.as_flattened())?;
         }
         Ok(())
     }
 
     fn floats(&mut self, name: &str, columns: usize, values: &[f32]) -> io::Result<()> {
-        self.array(name, Dtype::F32, columns, values, |v| v.to_le_bytes())
+        self.words(name, Dtype::F32, columns, bytemuck::cast_slice(values))
+    }
+
+    /// `values` is row-major `[rows, columns]`, of a type of four bytes.
+    fn words(&mut self, name: &str, dtype: Dtype, columns: usize, values: &[u32]) -> io::Result<()> {
+        self.start(name, dtype, columns, values.len())?;
+        write_words(&mut self.zip, values)
     }
 
     fn bytes(&mut self, name: &str, columns: usize, values: &[u8]) -> io::Result<()> {
-        self.array(name, Dtype::U8, columns, values, |&v| [v])
+        self.start(name, Dtype::U8, columns, values.len())?;
+        self.zip.write_all(values)
     }
 
-    /// `values` is row-major `[rows, columns]`.
-    fn array<T, const N: usize>(
-        &mut self,
-        name: &str,
-        dtype: Dtype,
-        columns: usize,
-        values: &[T],
-        bytes: impl Fn(&T) -> [u8; N],
-    ) -> io::Result<()> {
-        let header = npy::header_bytes(dtype, &[values.len() / columns, columns]);
-        let total = (header.len() + values.len() * N) as u64;
+    /// Everything of an array but its values.
+    fn start(&mut self, name: &str, dtype: Dtype, columns: usize, values: usize) -> io::Result<()> {
+        let header = npy::header_bytes(dtype, &[values / columns, columns]);
+        let total = (header.len() + values * dtype.size()) as u64;
         let method = match self.compression {
             NpzCompression::Stored => zip::CompressionMethod::Stored,
             NpzCompression::Deflated => zip::CompressionMethod::Deflated,
@@ -120,15 +120,6 @@ impl Archive<'_> {
         // The default time stamp is fixed (1980), so that the same input gives the same bytes.
         let options = SimpleFileOptions::default().compression_method(method).large_file(total >= ZIP64_FROM);
         self.zip.start_file(format!("{name}.npy"), options)?;
-        self.zip.write_all(&header)?;
-        const CHUNK: usize = 1 << 14;
-        let mut buffer = vec![[0; N]; CHUNK.min(values.len())];
-        for chunk in values.chunks(CHUNK) {
-            for (to, from) in buffer.iter_mut().zip(chunk) {
-                *to = bytes(from);
-            }
-            self.zip.write_all(buffer[..chunk.len()].as_flattened())?;
-        }
-        Ok(())
+        self.zip.write_all(&header)
     }
 }

@@ -53,6 +53,20 @@ impl Scalar {
         }
     }
 
+    /// Whether a number read from text is a value of the type.
+    pub(super) fn holds(self, value: f64) -> bool {
+        let (low, high) = match self {
+            Self::F32 | Self::F64 => return true,
+            Self::I8 => (i8::MIN.into(), i8::MAX.into()),
+            Self::U8 => (u8::MIN.into(), u8::MAX.into()),
+            Self::I16 => (i16::MIN.into(), i16::MAX.into()),
+            Self::U16 => (u16::MIN.into(), u16::MAX.into()),
+            Self::I32 => (i32::MIN.into(), i32::MAX.into()),
+            Self::U32 => (u32::MIN.into(), u32::MAX.into()),
+        };
+        (low..=high).contains(&value) && value.fract() == 0.0
+    }
+
     /// The big-endian value at the start of `bytes`, as [`Self::read`].
     pub(super) fn read_big_endian(self, bytes: &[u8]) -> Option<f64> {
         let mut reversed = [0; 8];
@@ -119,21 +133,22 @@ pub(super) struct Header {
     pub(super) bytes: usize,
 }
 
-/// Parses the header and checks that the file is long enough for the rows it announces.
+/// Parses the header at the start of a file of `file_bytes` and checks that the file is long enough for the rows it
+/// announces. `head` goes at least to the end of the header.
 ///
 /// # Errors
 /// `Invalid` with the byte offset of the offending line; `Unsupported` for an unknown encoding.
-pub(super) fn parse_header(path: &Path, file: &[u8]) -> Result<Header> {
+pub(super) fn parse_header(path: &Path, head: &[u8], file_bytes: usize) -> Result<Header> {
     let mut header = Header { encoding: Encoding::Ascii, elements: vec![], comments: vec![], bytes: 0 };
     let mut has_format = false;
     let mut is_first = true;
     loop {
         let at = header.bytes;
         let error = |reason: String| Error::invalid_at(path, at, reason);
-        let length = file[at..].iter().position(|&b| b == b'\n').ok_or_else(|| {
+        let length = head[at..].iter().position(|&b| b == b'\n').ok_or_else(|| {
             error("the PLY header has no `end_header` line; the file is cut short or no PLY".into())
         })?;
-        let line = std::str::from_utf8(&file[at..at + length])
+        let line = std::str::from_utf8(&head[at..at + length])
             .map_err(|_| error("the PLY header is not text".into()))?
             .trim_end_matches('\r');
         header.bytes = at + length + 1;
@@ -166,7 +181,7 @@ pub(super) fn parse_header(path: &Path, file: &[u8]) -> Result<Header> {
     if !has_format {
         return Err(Error::invalid(path, "the PLY header has no `format` line"));
     }
-    check_size(path, &header, file.len())?;
+    check_size(path, &header, file_bytes)?;
     Ok(header)
 }
 
@@ -204,7 +219,7 @@ fn check_size(path: &Path, header: &Header, file_bytes: usize) -> Result<()> {
         }
         sum.checked_add(element.count.checked_mul(element.min_row_bytes(header.encoding))?)
     });
-    let present = file_bytes - header.bytes;
+    let present = file_bytes.saturating_sub(header.bytes);
     // The last number of an ASCII file may lack its line end.
     match announced {
         Some(bytes) if bytes <= present + usize::from(header.encoding == Encoding::Ascii) => Ok(()),

@@ -3,7 +3,10 @@
 //! What PLY has no place for travels in header comments, which other readers skip:
 //! `comment divff name <name>`, `comment divff offset <x> <y> <z>`, `comment divff quality <attribute>`.
 
+mod body;
 mod header;
+mod layout;
+mod matrix;
 mod read;
 mod write;
 

@@ -1,13 +1,12 @@
 //! Geometry → PLY: the header as text, then rows packed in chunks on all cores and written in order.
 
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::Path;
-
-use rayon::prelude::*;
 
 use crate::atomic::write_atomically;
 use crate::error::{Error, Result};
 use crate::geometry::{AttributeValues, Geometry};
+use crate::rows::{triple_bytes, write_rows};
 use crate::validate::CLOUDCOMPARE_PREFIX;
 
 /// Choices that other programs' habits make necessary. The default is plain names and no copies.
@@ -18,9 +17,6 @@ pub struct PlyOptions {
     /// Prefix extra columns with `scalar_`: CloudCompare keeps only names that contain `scal`.
     pub cloudcompare: bool,
 }
-
-/// Bytes packed by one task: two such buffers per core stay in its second-level cache.
-const CHUNK_BYTES: usize = 256 * 1024;
 
 /// Values of neighbouring properties of a vertex. A whole block is copied at once: 32 feature columns one by one would
 /// pass over the rows 32 times.
@@ -67,7 +63,7 @@ pub fn write_ply(path: &Path, geometry: &Geometry, options: &PlyOptions) -> Resu
         write_rows(file, geometry.triangles.len(), FACE_BYTES, |first_face, rows| {
             for (row, triangle) in rows.chunks_exact_mut(FACE_BYTES).zip(&geometry.triangles[first_face..]) {
                 row[0] = 3;
-                row[1..].copy_from_slice(bytemuck::bytes_of(&triangle.map(u32::to_le)));
+                row[1..].copy_from_slice(&triple_bytes(*triangle));
             }
         })
     })
@@ -184,38 +180,11 @@ impl Block<'_> {
 }
 
 fn vector_bytes(vector: &[f32; 3]) -> [u8; 12] {
-    bytemuck::cast(vector.map(|v| v.to_bits().to_le()))
+    triple_bytes(bytemuck::cast(*vector))
 }
 
 fn pack<const N: usize>(rows: &mut [u8], stride: usize, at: usize, values: impl Iterator<Item = [u8; N]>) {
     for (row, value) in rows.chunks_exact_mut(stride).zip(values) {
         row[at..at + N].copy_from_slice(&value);
     }
-}
-
-/// Packs chunks of rows in parallel while the batch before is written.
-fn write_rows(
-    file: &mut (impl Write + Send),
-    rows: usize,
-    stride: usize,
-    pack: impl Fn(usize, &mut [u8]) + Sync,
-) -> io::Result<()> {
-    let rows_per_chunk = (CHUNK_BYTES / stride).max(1);
-    let rows_per_batch = rows_per_chunk * 4 * rayon::current_num_threads();
-    let pack_batch = |first_row: usize, batch: &mut Vec<u8>| {
-        batch.resize(rows_per_batch.min(rows.saturating_sub(first_row)) * stride, 0);
-        batch
-            .par_chunks_mut(rows_per_chunk * stride)
-            .enumerate()
-            .for_each(|(chunk, bytes)| pack(first_row + chunk * rows_per_chunk, bytes));
-    };
-    let (mut packed, mut next) = (Vec::new(), Vec::new());
-    pack_batch(0, &mut packed);
-    for first_row in (0..rows).step_by(rows_per_batch) {
-        let (written, ()) =
-            rayon::join(|| file.write_all(&packed), || pack_batch(first_row + rows_per_batch, &mut next));
-        written?;
-        std::mem::swap(&mut packed, &mut next);
-    }
-    Ok(())
 }
