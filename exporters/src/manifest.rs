@@ -48,6 +48,9 @@ pub struct Manifest {
     /// What the export could have held and does not, or shares, and why.
     #[serde(default)]
     pub skipped: Vec<SkippedEntry>,
+    /// Meshes that have fewer triangles than the surface they stand for, and how far they are from it.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub simplified: Vec<SimplifiedEntry>,
     /// Program and version.
     pub tool_version: String,
     /// Seed of the run.
@@ -112,6 +115,38 @@ pub struct SkippedEntry {
     pub what: String,
     /// Why.
     pub why: String,
+}
+
+/// A mesh with fewer triangles, and what that costs.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct SimplifiedEntry {
+    /// Object that it was made for.
+    pub name: String,
+    /// Distance that was allowed, world units.
+    pub tolerance: f64,
+    /// Largest distance between the two surfaces that was found, from both sides, world units.
+    pub largest_distance: f64,
+    /// Triangles before.
+    pub triangles_before: usize,
+    /// Triangles after.
+    pub triangles_after: usize,
+    /// Parts that were triangulated on their own.
+    pub patches: usize,
+    /// Parts among them that kept all their triangles.
+    pub kept_patches: usize,
+    /// Attributes that had to stay within a tolerance.
+    pub deviations: Vec<DeviationEntry>,
+}
+
+/// How far an attribute is from what it was at any of the original's vertices.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DeviationEntry {
+    /// `color` (8-bit steps), a score's column, or a feature matrix (length of the difference).
+    pub name: String,
+    /// Deviation that was allowed.
+    pub tolerance: f64,
+    /// Largest that was found.
+    pub largest: f64,
 }
 
 /// A file of the export.
@@ -190,10 +225,18 @@ impl Manifest {
         let ranges = self.attributes.iter().flat_map(|attribute| &attribute.range);
         let times =
             self.time_intervals.iter().flat_map(|interval| [&interval.time_start, &interval.time_end]);
-        if matrix.chain(&self.offset).chain(ranges).chain(times).all(|value| value.is_finite()) {
+        let errors = self.simplified.iter().flat_map(|s| {
+            let columns = s.deviations.iter().flat_map(|d| [&d.tolerance, &d.largest]);
+            [&s.tolerance, &s.largest_distance].into_iter().chain(columns)
+        });
+        let all = matrix.chain(&self.offset).chain(ranges).chain(times).chain(errors);
+        if all.copied().all(f64::is_finite) {
             Ok(())
         } else {
-            Err(Error::inconsistent(MANIFEST_NAME, "the transform, offset, ranges and times must be finite"))
+            Err(Error::inconsistent(
+                MANIFEST_NAME,
+                "the transform, offset, ranges, times and errors must be finite",
+            ))
         }
     }
 }
@@ -231,6 +274,16 @@ mod tests {
         let mut manifest = Manifest {
             format_version: FORMAT_VERSION,
             units: "metre".into(),
+            simplified: vec![SimplifiedEntry {
+                name: "persistent".into(),
+                tolerance: 0.005,
+                largest_distance: 0.004,
+                triangles_before: 100,
+                triangles_after: 10,
+                patches: 2,
+                kept_patches: 1,
+                deviations: vec![DeviationEntry { name: "color".into(), tolerance: 16.0, largest: 15.5 }],
+            }],
             attributes: vec![AttributeEntry { name: "label".into(), kind: "i32".into(), range: [-1.0, 7.0] }],
             ..Manifest::default()
         };
@@ -251,6 +304,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let manifest = Manifest { offset: [f64::NAN, 0.0, 0.0], ..Manifest::default() };
         assert!(manifest.write(folder.path()).is_err());
+        let far = SimplifiedEntry { largest_distance: f64::INFINITY, ..SimplifiedEntry::default() };
+        assert!(Manifest { simplified: vec![far], ..Manifest::default() }.write(folder.path()).is_err());
         assert!(!folder.path().join(MANIFEST_NAME).exists());
     }
 

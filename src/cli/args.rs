@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use divff::bench::Kind;
-use divff::map::Times;
+use divff::map::{Simplify, Times};
 
 /// Semantic 3D maps from egocentric video, on a plain CPU.
 #[derive(Debug, Parser)]
@@ -145,6 +145,10 @@ pub struct SettingsArgs {
     /// Compress features to as few numbers as lose at most this (1 - mean cosine, such as 0.02), instead of to 32
     #[arg(long, value_name = "E")]
     pub feature_error: Option<f64>,
+    /// Fewer triangles in the map's meshes, none of them farther from where they were than this: 5mm, 0.5cm, 0.005 (world
+    /// units), or none [default: none]
+    #[arg(long, value_name = "LENGTH", value_parser = Simplify::from_str)]
+    pub simplify: Option<Simplify>,
 }
 
 /// File formats of an export.
@@ -191,6 +195,10 @@ pub struct ExportArgs {
     /// Side of a voxel, world units [default: 1/350 of the diagonal of the scene's box]
     #[arg(long, value_name = "LENGTH", allow_negative_numbers = true)]
     pub voxel: Option<f64>,
+    /// Fewer triangles, none of them farther from where they were than this: 5mm, 0.5cm, 0.005 (world units), or none
+    /// [default: as in the run]
+    #[arg(long, value_name = "LENGTH", value_parser = Simplify::from_str)]
+    pub simplify: Option<Simplify>,
     /// Where the scene is, if it was moved
     #[arg(long, value_name = "SCENE")]
     pub scene: Option<PathBuf>,

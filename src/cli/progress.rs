@@ -119,6 +119,7 @@ impl Observer for Reporter {
                     (map::Stage::Dynamic, "what is moved"),
                     (map::Stage::Actor, "who moves it"),
                     (map::Stage::Points, "points"),
+                    (map::Stage::Simplify, "simplifying"),
                 ];
                 let part = stages.iter().position(|(s, _)| *s == p.stage).unwrap_or(0);
                 let inside = p.done as f64 / p.total.max(1) as f64;

@@ -64,6 +64,7 @@ pub fn export(args: &ExportArgs, stop: StopFlag) -> Result<(), CliError> {
     config.map.streams = Stream::ALL.into_iter().filter(|s| wanted[*s as usize]).collect();
     config.map.times = args.times.clone();
     config.map.voxel_size = args.voxel.or(config.map.voxel_size);
+    config.map.simplify = args.simplify.unwrap_or(config.map.simplify);
     config.validate()?;
     create_writable(&args.out)?;
     let trained = run.trained()?;
@@ -88,6 +89,12 @@ pub fn export(args: &ExportArgs, stop: StopFlag) -> Result<(), CliError> {
     }
     for s in &manifest.skipped {
         say(format_args!("skipped {}: {}", s.what, s.why))?;
+    }
+    for s in &manifest.simplified {
+        say(format_args!(
+            "{}: {} of {} triangles, at most {:.4} from where they were",
+            s.name, s.triangles_after, s.triangles_before, s.largest_distance
+        ))?;
     }
     say(format_args!("{} files in {}", manifest.files.len(), args.out.display()))
 }

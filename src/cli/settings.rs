@@ -41,12 +41,14 @@ pub fn resolve(args: &SettingsArgs) -> Result<Config, CliError> {
         config.semantics.compress.feature_error = error;
         config.semantics.compress.dim = None;
     }
+    config.map.simplify = args.simplify.unwrap_or(config.map.simplify);
     config.validate()?;
     Ok(config)
 }
 
 #[cfg(test)]
 mod tests {
+    use divff::map::Simplify;
     use divff::train::StreamChoice;
 
     use super::*;
@@ -81,11 +83,13 @@ mod tests {
             seed: None,
             time_budget: None,
             feature_error: Some(0.05),
+            simplify: Some("5mm".parse().unwrap()),
         };
         let config = resolve(&args).unwrap();
         assert_eq!((config.seed, config.train.steps, config.train.rays), (3, 10, 128));
         let compress = &config.semantics.compress;
         assert_eq!((compress.dim, compress.feature_error), (None, 0.05));
+        assert_eq!(config.map.simplify, Simplify::Within(0.005));
         assert!(resolve(&SettingsArgs { feature_error: Some(2.0), ..args }).is_err());
     }
 }

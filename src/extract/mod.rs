@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! density closure ─ grid ─┐
-//!                         ├─ march ─ clean ─ visibility ─ sample
+//!                         ├─ march ─ clean ─ visibility ─ sample, simplify
 //! depth maps ───── tsdf ──┘
 //! ```
 //!
@@ -19,6 +19,7 @@ mod march_dense;
 mod mc_table;
 mod mesh;
 pub mod sample;
+pub mod simplify;
 pub mod tsdf;
 mod view;
 pub mod visibility;

@@ -14,7 +14,7 @@ use crate::render::sampler::Sampling;
 use crate::scene::Scene;
 use crate::train::Trained;
 
-/// The stages of [`build`] in order.
+/// The stages of [`build`] in order, and the one after it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Stage {
     /// Depth of every training frame.
@@ -27,6 +27,8 @@ pub enum Stage {
     Actor,
     /// The point cloud.
     Points,
+    /// Fewer triangles, after all attributes are there: [`super::simplify`].
+    Simplify,
 }
 
 /// How far [`build`] has come.
@@ -101,6 +103,7 @@ impl<'a> Builder<'a> {
             features: Vec::new(),
             affordances: Vec::new(),
             skipped: Vec::new(),
+            simplified: Vec::new(),
             up_axis,
             up_is_known,
             normalisation: n,

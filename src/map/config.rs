@@ -104,6 +104,71 @@ impl fmt::Display for TimePoint {
     }
 }
 
+/// How far simplified meshes may be from the full ones: `none`, or a length: `5mm`, `0.5cm`, `0.01m`, or in world units
+/// `0.005`. With a metric unit, a world unit is taken for a metre.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Length", into = "String")]
+pub enum Simplify {
+    /// Meshes keep all their triangles.
+    #[default]
+    None,
+    /// Largest distance, world units.
+    Within(f64),
+}
+
+/// A length as it may stand in a file: text or a bare number.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Length {
+    Number(f64),
+    Text(String),
+}
+
+impl FromStr for Simplify {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let trimmed = text.trim();
+        if trimmed == "none" {
+            return Ok(Self::None);
+        }
+        let units = [("mm", 1000.0), ("cm", 100.0), ("m", 1.0)];
+        let unit = units.iter().find_map(|(unit, parts)| Some((trimmed.strip_suffix(unit)?, *parts)));
+        let (number, parts) = unit.unwrap_or((trimmed, 1.0));
+        let length = number.trim_end().parse::<f64>().map(|n| n / parts);
+        let length = length.ok().filter(|l| l.is_finite() && *l > 0.0);
+        length.map(Self::Within).ok_or_else(|| {
+            format!("`{text}` is no tolerance; give none, or a length such as 5mm, 0.5cm or 0.005")
+        })
+    }
+}
+
+impl TryFrom<Length> for Simplify {
+    type Error = String;
+
+    fn try_from(length: Length) -> Result<Self, String> {
+        match length {
+            Length::Number(n) => n.to_string().parse(),
+            Length::Text(text) => text.parse(),
+        }
+    }
+}
+
+impl fmt::Display for Simplify {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::None => f.write_str("none"),
+            Self::Within(length) => write!(f, "{length}"),
+        }
+    }
+}
+
+impl From<Simplify> for String {
+    fn from(simplify: Simplify) -> Self {
+        simplify.to_string()
+    }
+}
+
 /// Settings of the extraction.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -137,6 +202,14 @@ pub struct MapConfig {
     pub smoothing: u32,
     /// Views that must have seen at least one vertex of a triangle.
     pub min_observations: u32,
+    /// Whether meshes get fewer triangles, and how far they may be from the full ones.
+    pub simplify: Simplify,
+    /// How far simplified colours may be off: length of the difference, 8-bit steps.
+    pub simplify_color: f32,
+    /// How far simplified scores may be off.
+    pub simplify_score: f32,
+    /// How far simplified features may be off, as a share of the features' root-mean-square length.
+    pub simplify_feature: f32,
     /// Playing time of the animation in `scene.glb`, seconds.
     pub animation_seconds: f64,
 }
@@ -158,6 +231,10 @@ impl Default for MapConfig {
             min_component_voxels: 12.0,
             smoothing: 2,
             min_observations: 1,
+            simplify: Simplify::None,
+            simplify_color: 48.0,
+            simplify_score: 0.1,
+            simplify_feature: 0.25,
             animation_seconds: 10.0,
         }
     }
@@ -188,6 +265,9 @@ impl MapConfig {
         for (key, value) in [
             ("map.truncation_voxels", self.truncation_voxels),
             ("map.opaque_voxels", f64::from(self.opaque_voxels)),
+            ("map.simplify_color", f64::from(self.simplify_color)),
+            ("map.simplify_score", f64::from(self.simplify_score)),
+            ("map.simplify_feature", f64::from(self.simplify_feature)),
             ("map.animation_seconds", self.animation_seconds),
         ] {
             range(key, value.to_string(), value > 0.0 && value.is_finite(), "must be positive")?;
@@ -215,6 +295,23 @@ mod tests {
         for bad in ["", "1.5", "-0.1", "NaN", "frame:", "frame:-1", "some", "0.1,,0.2"] {
             assert!(bad.parse::<Times>().is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn tolerances_are_lengths_with_or_without_a_unit() {
+        for text in ["5mm", " 0.5 cm", "0.005", "0.005m", "5e-3"] {
+            assert_eq!(text.parse::<Simplify>(), Ok(Simplify::Within(0.005)), "{text}");
+        }
+        assert_eq!("none".parse(), Ok(Simplify::None));
+        for bad in ["", "mm", "0", "-5mm", "5km", "inf", "NaN", "5 mmm", "none5"] {
+            assert!(bad.parse::<Simplify>().is_err(), "{bad}");
+        }
+        for toml in ["simplify = 0.005", "simplify = \"5mm\"", "simplify = \"0.005\""] {
+            assert_eq!(toml::from_str::<MapConfig>(toml).unwrap().simplify, Simplify::Within(0.005));
+        }
+        let config = MapConfig { simplify: Simplify::Within(0.003), ..MapConfig::default() };
+        assert_eq!(toml::from_str::<MapConfig>(&toml::to_string(&config).unwrap()).unwrap(), config);
+        assert!(MapConfig { simplify_color: 0.0, ..config }.validate().is_err());
     }
 
     #[test]

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! Scene + Trained ─ views (depth of every training frame) ─ persistent ─┐
-//!                 ─ moving (dynamic and actor, per time) ───────────────┼─ SemanticMap ─ write ─ files
+//!                 ─ moving (dynamic and actor, per time) ───────────────┼─ SemanticMap ─ simplify ─ write ─ files
 //!                                                        points ────────┘
 //! ```
 
@@ -13,6 +13,7 @@ mod moving;
 mod persistent;
 mod place;
 mod points;
+mod simplify;
 mod surface;
 #[cfg(test)]
 mod tests;
@@ -20,13 +21,15 @@ mod times;
 mod views;
 mod write;
 
+use divff_exporters::manifest::SimplifiedEntry;
 use divff_exporters::{Geometry, Interval, UpAxis};
 use serde::Serialize;
 
 pub use self::build::{Progress, Stage, build};
-pub use self::config::{MapConfig, SurfaceMethod, TimePoint, Times};
+pub use self::config::{MapConfig, Simplify, SurfaceMethod, TimePoint, Times};
 pub use self::error::MapError;
 pub use self::place::default_voxel;
+pub use self::simplify::simplify;
 pub use self::write::{Format, write};
 use crate::field::{Normalisation, Stream};
 
@@ -42,6 +45,8 @@ pub struct SemanticMap {
     pub points: Geometry,
     /// What was left out or shared, and why.
     pub skipped: Vec<Skipped>,
+    /// What [`simplify`] did to each geometry.
+    pub simplified: Vec<SimplifiedEntry>,
     /// Features that the geometries have.
     pub features: Vec<MapFeatures>,
     /// Phrases of the columns `affordance_<slug>`: slug and phrase.

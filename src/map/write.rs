@@ -222,6 +222,7 @@ fn describe(map: &SemanticMap) -> Manifest {
         features: map.features.iter().map(feature_entry).collect(),
         affordances: map.affordances.iter().map(affordance_entry).collect(),
         skipped,
+        simplified: map.simplified.clone(),
         tool_version: concat!("divff ", env!("CARGO_PKG_VERSION")).into(),
         seed: map.seed,
         ..Manifest::default()

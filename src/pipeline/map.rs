@@ -14,7 +14,7 @@ use crate::semantics::SemanticFields;
 use crate::semantics::bake::annotate;
 use crate::train::Trained;
 
-/// Builds the map of a trained field, with the features and scores of `fields`, and writes it to `out`, with the times
+/// Builds the map of a trained field, with the features and scores of `fields`, simplifies it if asked to, and writes it to `out`, with the times
 /// that it took into `cost`.
 ///
 /// `None` if the observer said stop; the folder then holds no manifest, or an earlier map.
@@ -39,6 +39,7 @@ pub fn export_map(
     if let Some(fields) = fields {
         annotate(&mut map, scene, trained, fields, &config.semantics)?;
     }
+    map::simplify(&mut map, &config.map, &mut |p| observer.event(&Event::Mapping(p)))?;
     cost.extract_seconds = Some(start.elapsed().as_secs_f64());
     if observer.stop() {
         return Ok(None);
