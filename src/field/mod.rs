@@ -263,11 +263,16 @@ fn empty_tables(net: &StreamNet) -> Vec<Vec<Row>> {
     net.grid.levels.iter().map(|l| vec![Row::ZERO; l.rows]).collect()
 }
 
-/// Real spherical harmonics of degree 1 to 4 of a unit direction, without their constants' signs.
+/// What degrees 3 and 4 of the view encoding are multiplied by: colours that change fast with the direction are learned slowly, and
+/// so only of what is seen from many directions. At full size, few views would be explained by them and not by geometry.
+pub const FAST_CHANGE: [f32; 2] = [0.3, 0.2];
+
+/// Real spherical harmonics of degree 1 to 4 of a unit direction, without their constants' signs; degrees 3 and 4 times
+/// [`FAST_CHANGE`].
 pub fn view_encoding(d: Vec3) -> [f32; VIEW] {
     let Vec3 { x, y, z } = d;
     let (xx, yy, zz) = (x * x, y * y, z * z);
-    [
+    let mut encoding = [
         0.488_602_5 * y,
         0.488_602_5 * z,
         0.488_602_5 * x,
@@ -292,5 +297,8 @@ pub fn view_encoding(d: Vec3) -> [f32; VIEW] {
         0.473_087_35 * (xx - yy) * (7.0 * zz - 1.0),
         1.770_130_8 * x * z * (xx - 3.0 * yy),
         0.625_835_74 * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy)),
-    ]
+    ];
+    encoding[8..15].iter_mut().for_each(|v| *v *= FAST_CHANGE[0]);
+    encoding[15..].iter_mut().for_each(|v| *v *= FAST_CHANGE[1]);
+    encoding
 }

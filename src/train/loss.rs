@@ -46,7 +46,7 @@ impl Default for LossConfig {
         Self {
             beta_min: 0.03,
             transient: 0.01,
-            transient_opacity: [8.0, 4.0],
+            transient_opacity: [8.0, 2.0],
             moving: 20.0,
             distortion: 0.3,
             entropy: 0.0,

@@ -10,7 +10,7 @@ use crate::field::codes::Trajectory;
 use crate::field::hashgrid::{AXES, FEATURES, Level};
 use crate::field::mlp::Mlp;
 use crate::field::stream::BETA_MAX;
-use crate::field::{Field, VIEW};
+use crate::field::{FAST_CHANGE, Field, VIEW};
 use crate::render::forward::{Chunk, RayInput};
 use crate::render::rays::View;
 use crate::train::loss::flatness::{self, Bend};
@@ -272,7 +272,7 @@ pub fn network(net: &Mlp, params: &[f64], mut x: Vec<f64>) -> Vec<f64> {
 }
 
 /// Real spherical harmonics of degree 1 to 4 by their definition: associated Legendre functions of the polar angle times
-/// sines and cosines of the azimuth, from order −l to l, without the Condon–Shortley sign.
+/// sines and cosines of the azimuth, from order −l to l, without the Condon–Shortley sign; times their share.
 fn harmonics(d: DVec3) -> [f64; VIEW] {
     let azimuth = d.y.atan2(d.x);
     let mut out = [0.0; VIEW];
@@ -288,7 +288,8 @@ fn harmonics(d: DVec3) -> [f64; VIEW] {
                 _ if m > 0 => std::f64::consts::SQRT_2 * (f64::from(order) * azimuth).cos(),
                 _ => std::f64::consts::SQRT_2 * (f64::from(order) * azimuth).sin(),
             };
-            out[n] = norm.sqrt() * legendre(l, order, d.z) * turn;
+            let share = if l > 2 { f64::from(FAST_CHANGE[l as usize - 3]) } else { 1.0 };
+            out[n] = share * norm.sqrt() * legendre(l, order, d.z) * turn;
             n += 1;
         }
     }
