@@ -112,9 +112,11 @@ impl Config {
             Err(_) => format!("{key} = {}", toml::Value::String(value.to_owned())),
         };
         self.overlaid(&text, &origin).map_err(|error| match error {
-            // The parser's picture of the line only repeats what was typed.
             ConfigError::Syntax { origin, message } => {
-                ConfigError::Syntax { origin, message: message.lines().last().unwrap_or_default().to_owned() }
+                // The parser draws a picture of the line above what is wrong; a value that does not fit has its table below.
+                let mut lines = message.lines();
+                let line = if message.starts_with("TOML parse error") { lines.last() } else { lines.next() };
+                ConfigError::Syntax { origin, message: line.unwrap_or_default().to_owned() }
             }
             other => other,
         })

@@ -69,6 +69,8 @@ mod tests {
             assert!(message.contains(&format!("--set {wrong}")), "{message}");
             assert!(!message.contains('\n'), "{message}");
         }
+        let unknown = Config::default().with_setting("train.stepz=1").unwrap_err().to_string();
+        assert!(unknown.contains("unknown field `stepz`"), "{unknown}");
     }
 
     #[test]
