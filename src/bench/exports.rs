@@ -23,12 +23,15 @@ use crate::train::Trained;
 /// What is written and what comes back, as columns.
 type Columns = Vec<Vec<f32>>;
 
+/// What is done with a file.
+type Step<'a, T> = Box<dyn Fn(&Path) -> Result<T, Error> + 'a>;
+
 /// A way to write something, and its way back.
 struct Way<'a> {
     name: &'static str,
     file: &'static str,
-    write: Box<dyn Fn(&Path) -> Result<(), Error> + 'a>,
-    read: Box<dyn Fn(&Path) -> Result<Columns, Error> + 'a>,
+    write: Step<'a, ()>,
+    read: Step<'a, Columns>,
     truth: Columns,
     /// Script of the program that is timed at writing the same.
     peer: Option<&'static str>,

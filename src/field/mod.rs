@@ -296,7 +296,7 @@ pub fn view_encoding(d: Vec3) -> [f32; VIEW] {
         0.669_046_5 * x * z * (7.0 * zz - 3.0),
         0.473_087_35 * (xx - yy) * (7.0 * zz - 1.0),
         1.770_130_8 * x * z * (xx - 3.0 * yy),
-        0.625_835_74 * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy)),
+        0.625_835_7 * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy)),
     ];
     encoding[8..15].iter_mut().for_each(|v| *v *= FAST_CHANGE[0]);
     encoding[15..].iter_mut().for_each(|v| *v *= FAST_CHANGE[1]);

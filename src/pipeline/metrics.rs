@@ -70,7 +70,7 @@ impl Cost {
     }
 }
 
-/// What empty-space skipping and settling the streams saved while training.
+/// What empty-space skipping, settling the streams and exact poses saved while training.
 pub fn skipped_in_training(state: &TrainingState, streams: [bool; 3]) -> BTreeMap<String, serde_json::Value> {
     let mut skipped = BTreeMap::new();
     let saved = state.candidates.saturating_sub(state.evaluations);
@@ -82,6 +82,11 @@ pub fn skipped_in_training(state: &TrainingState, streams: [bool; 3]) -> BTreeMa
     let absent: Vec<&str> =
         crate::field::Stream::ALL.iter().filter(|s| !streams[**s as usize]).map(|s| s.name()).collect();
     skipped.insert("streams".to_owned(), absent.into());
+    if let (true, Some(coverage)) = (state.trusts_poses, state.given_coverage) {
+        let why =
+            format!("stereo finds the depth of {:.0} % of pixels from the poses as given", 100.0 * coverage);
+        skipped.insert("pose_refinement".to_owned(), why.into());
+    }
     skipped
 }
 

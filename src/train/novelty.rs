@@ -95,7 +95,7 @@ mod tests {
         // Nine frames look the same way, one looks back.
         let mut frames: Vec<Frame> = (0..10).map(|_| frame(0.5)).collect();
         let back = DAffine3::from_mat3(DMat3::from_rotation_y(std::f64::consts::PI));
-        frames[9].c2w = frames[9].c2w * back;
+        frames[9].c2w *= back;
         let count = |share: f64| {
             let novelty = Novelty::new(&frames, 2.0, share);
             let mut rng = Rng::new(1, 2, 3);

@@ -80,11 +80,12 @@ impl Numbers {
             let x = active.trailing_zeros();
             active &= active - 1;
             let mut numbers = [0; 2 * STARTS];
+            let (before, after) = numbers.split_at_mut(STARTS);
+            before.copy_from_slice(&self.0);
             for k in 0..STARTS {
-                numbers[k] = self.0[k];
                 self.0[k] += (word.cuts[k] >> x) as u32 & 1;
-                numbers[STARTS + k] = self.0[k];
             }
+            after.copy_from_slice(&self.0);
             let case = &cases.0[word.case(x) & 255];
             let cell = out.split_off_mut(..usize::from(case.count)).unwrap_or_default();
             for (triangle, places) in cell.iter_mut().zip(&case.places) {

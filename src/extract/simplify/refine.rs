@@ -149,8 +149,7 @@ impl Refiner<'_> {
             let distance = (pb - pa).perp_dot(p - pa) / (pb - pa).length().max(f64::MIN_POSITIVE);
             let bends = segment.span.filter(|s| s.to - s.from > 1);
             let least = if bends.is_some() { SLIVER * self.scene.tolerance } else { 0.0 };
-            // Written so that a NaN fails.
-            if !(distance > least) {
+            if distance.is_nan() || distance <= least {
                 return Err(Failure::of_rim(bends.into_iter().collect()));
             }
         }

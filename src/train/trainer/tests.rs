@@ -92,3 +92,33 @@ fn resuming_gives_the_bytes_of_an_uninterrupted_training() {
         assert!(bytes(&mut second) == straight, "static until {static_until}: resumed to other bytes");
     }
 }
+
+#[test]
+fn a_refinement_from_which_stereo_finds_less_is_undone() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    let mut trainer = Trainer::new(&scene, &config(0.3)).expect("the test's scene is valid");
+    let refinement = trainer.trained.field.layout.refinement();
+    for (given, left) in [(0.0, 1e-3), (2.0, 0.0)] {
+        trainer.trained.field.weights[refinement.clone()].fill(1e-3);
+        trainer.trained.progress.given_coverage = Some(given);
+        trainer.settle_poses();
+        assert_eq!(trainer.trained.progress.trusts_poses, left == 0.0);
+        assert!(trainer.trained.field.weights[refinement.clone()].iter().all(|w| *w == left));
+    }
+}
+
+#[test]
+fn trusted_poses_are_not_refined() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    for trusts in [true, false] {
+        let mut trainer = Trainer::new(&scene, &config(0.3)).expect("the test's scene is valid");
+        trainer.trained.progress.trusts_poses = trusts;
+        for _ in 0..4 {
+            trainer.step(0.5, None).expect("the numbers stay finite");
+        }
+        let refinement = &trainer.trained.field.weights[trainer.trained.field.layout.refinement()];
+        assert_eq!(refinement.iter().all(|w| *w == 0.0), trusts);
+    }
+}
