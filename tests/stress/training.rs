@@ -49,7 +49,8 @@ fn frozen_rates_leave_every_number_as_it_was() {
 
 #[test]
 fn exploding_rates_end_in_an_error_before_anything_is_stored() {
-    let rates: [(&str, fn(&mut Config)); 5] = [
+    type Change = fn(&mut Config);
+    let rates: [(&str, Change); 5] = [
         ("tables", |c| c.train.table_rate = 1e30),
         ("networks", |c| c.train.network_rate = 1e20),
         ("exposures", |c| c.train.exposure_rate = 1e30),
