@@ -35,7 +35,9 @@ struct Way<'a> {
 }
 
 /// Error, bytes and seconds of every way to store the mesh of what stays, the points and a view.
-pub(super) fn export(bench: &mut Bench) -> Result<Option<Sweep>, PipelineError> {
+///
+/// A sweep for each of them: only files of the same content can take each other's place.
+pub(super) fn export(bench: &mut Bench) -> Result<Option<Vec<Sweep>>, PipelineError> {
     let Some(run) = base(bench)? else { return Ok(None) };
     bench.announce(Kind::Export, "map and view");
     bench.observer.event(&Event::Stage(Stage::Mapping));
@@ -49,30 +51,33 @@ pub(super) fn export(bench: &mut Bench) -> Result<Option<Sweep>, PipelineError> 
     let folder = bench.out.join("exports");
     std::fs::create_dir_all(&folder).map_err(FileError::at(&folder))?;
     let view = rendered(bench, &run.trained);
-    let mut ways = Vec::new();
-    if !map.points.positions.is_empty() {
-        ways.extend(clouds(&map.points));
-    }
-    if let Some(mesh) = map.geometries.first() {
-        ways.extend(meshes(mesh, map.up_axis));
-    }
-    if let Some(view) = &view {
-        ways.extend(views(view));
-    }
     bench.observer.event(&Event::Stage(Stage::Exporting));
-    let rows = ways.iter().map(|way| way.measure(&folder)).collect::<Result<Vec<_>, _>>()?;
-    let (name, title) = (Kind::Export.name(), "Files: what is lost, size and seconds");
-    let plots = vec![
-        Plot { cost: "mb", quality: "error", better: Better::Lower },
-        Plot { cost: "write_ms", quality: "mb", better: Better::Lower },
+    let mesh = map.geometries.first();
+    let cloud = Some(&map.points).filter(|p| !p.positions.is_empty());
+    let all = [
+        ("export_points", "Files of points: what is lost, size and seconds", cloud.map(clouds)),
+        (
+            "export_mesh",
+            "Files of a mesh: what is lost, size and seconds",
+            mesh.map(|m| meshes(m, map.up_axis)),
+        ),
+        ("export_view", "Files of a view: what is lost, size and seconds", view.as_ref().map(views)),
     ];
-    let notes = vec![
-        "error: the largest difference of a value that is read back, as a share of its column's range; \
-         peer_ratio: how many times as long Open3D, plyfile (points) or trimesh (mesh) take to write what they keep of it"
-            .to_owned(),
-    ];
-    Ok(Some(Sweep { name, title, rows, plots, notes }))
+    let mut sweeps = Vec::new();
+    for (name, title, ways) in all {
+        let measured: Result<Vec<Row>, _> = ways.iter().flatten().map(|way| way.measure(&folder)).collect();
+        let plots = vec![
+            Plot { cost: "mb", quality: "error", better: Better::Lower },
+            Plot { cost: "write_ms", quality: "mb", better: Better::Lower },
+        ];
+        sweeps.push(Sweep { name, title, rows: measured?, plots, notes: vec![NOTE.to_owned()] });
+    }
+    Ok(Some(sweeps))
 }
+
+/// How to read the columns.
+const NOTE: &str = "error: the largest difference of a value that is read back, as a share of its column's range; \
+    peer_ratio: how many times as long Open3D, plyfile (points) or trimesh (mesh) take to write what they keep of it";
 
 impl Way<'_> {
     fn measure(&self, folder: &Path) -> Result<Row, PipelineError> {
@@ -124,10 +129,10 @@ fn clouds(points: &Geometry) -> Vec<Way<'_>> {
         peer: Some(peer),
     };
     vec![
-        ply(peers::OPEN3D_PLY, "points, PLY (peer: Open3D)", "points.ply"),
-        ply(peers::PLYFILE_PLY, "points, PLY (peer: plyfile)", "points2.ply"),
+        ply(peers::OPEN3D_PLY, "PLY beside Open3D", "points.ply"),
+        ply(peers::PLYFILE_PLY, "PLY beside plyfile", "points2.ply"),
         Way {
-            name: "points, NPZ stored",
+            name: "NPZ stored",
             file: "stored.npz",
             write: Box::new(npz(NpzCompression::Stored)),
             read: read(),
@@ -135,7 +140,7 @@ fn clouds(points: &Geometry) -> Vec<Way<'_>> {
             peer: None,
         },
         Way {
-            name: "points, NPZ deflated",
+            name: "NPZ deflated",
             file: "deflated.npz",
             write: Box::new(npz(NpzCompression::Deflated)),
             read: read(),
@@ -160,15 +165,15 @@ fn meshes(mesh: &Geometry, up_axis: UpAxis) -> Vec<Way<'_>> {
     };
     vec![
         Way {
-            name: "mesh, PLY",
+            name: "PLY",
             file: "mesh.ply",
             write: Box::new(|path| write_ply(path, mesh, &PlyOptions::default())),
             read: Box::new(|path| Ok(columns(&read_ply(path)?, true))),
             truth: columns(mesh, true),
             peer: Some(peers::TRIMESH_MESH),
         },
-        glb("mesh, GLB with u16 colours", "u16.glb", false),
-        glb("mesh, GLB with f32 colours", "f32.glb", true),
+        glb("GLB with u16 colours", "u16.glb", false),
+        glb("GLB with f32 colours", "f32.glb", true),
     ]
 }
 
@@ -181,7 +186,7 @@ fn views(view: &Columns) -> Vec<Way<'_>> {
         truth: view[..view.len() - 1].to_vec(),
         peer: None,
     };
-    vec![way("view, EXR of f16", "f16.exr", true), way("view, EXR of f32", "f32.exr", false)]
+    vec![way("EXR of f16", "f16.exr", true), way("EXR of f32", "f32.exr", false)]
 }
 
 /// Channels `a`, `b`, … of columns; the last column holds the width alone.

@@ -134,15 +134,16 @@ impl Bench<'_> {
         if self.quick { quick } else { full }
     }
 
-    fn sweep(&mut self, kind: Kind) -> Result<Option<Sweep>, PipelineError> {
-        match kind {
+    fn sweep(&mut self, kind: Kind) -> Result<Option<Vec<Sweep>>, PipelineError> {
+        let found = match kind {
             Kind::Training => runs::training(self),
             Kind::Encoding => runs::encoding(self),
             Kind::Voxel => maps::voxel(self),
             Kind::Method => maps::method(self),
             Kind::Features => features::features(self),
-            Kind::Export => exports::export(self),
-        }
+            Kind::Export => return exports::export(self),
+        };
+        Ok(found?.map(|sweep| vec![sweep]))
     }
 }
 
@@ -163,12 +164,14 @@ pub fn run(
     let mut bench = Bench { scene, config, out, quick: options.quick, observer, base: None };
     let mut found = Vec::new();
     for kind in Kind::ALL.into_iter().filter(|k| options.sweeps.contains(k)) {
-        let Some(sweep) = bench.sweep(kind)? else { return Ok(None) };
-        write_bytes_atomically(&out.join(format!("{kind}.csv")), sweep.csv().as_bytes())?;
-        for (name, svg) in sweep.pictures() {
-            write_bytes_atomically(&out.join(format!("{name}.svg")), standalone(&svg).as_bytes())?;
+        let Some(sweeps) = bench.sweep(kind)? else { return Ok(None) };
+        for sweep in sweeps {
+            write_bytes_atomically(&out.join(format!("{}.csv", sweep.name)), sweep.csv().as_bytes())?;
+            for (name, svg) in sweep.pictures() {
+                write_bytes_atomically(&out.join(format!("{name}.svg")), standalone(&svg).as_bytes())?;
+            }
+            found.push(sweep);
         }
-        found.push(sweep);
         // After each, so that what there is can be looked at.
         write_bytes_atomically(&out.join("bench.md"), page::markdown(scene, &found).as_bytes())?;
         write_bytes_atomically(&out.join("index.html"), page::html(scene, &found).as_bytes())?;
