@@ -1,6 +1,6 @@
 //! Geometry → NPZ.
 
-use std::io::{self, Write};
+use std::io::{self, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use serde_json::json;
@@ -32,12 +32,11 @@ const ZIP64_FROM: u64 = u32::MAX as u64;
 pub fn write_npz(path: &Path, geometry: &Geometry, compression: NpzCompression) -> Result<()> {
     geometry.validate()?;
     write_atomically(path, |file| {
-        let mut archive = Archive { zip: ZipWriter::new(file), compression };
-        archive.geometry(geometry)?;
-        let note = json!({ "name": geometry.name, "offset": geometry.offset });
-        archive.zip.set_comment(note.to_string());
-        archive.zip.finish()?;
-        Ok(())
+        write_archive(file, compression, |archive| {
+            let note = json!({ "name": geometry.name, "offset": geometry.offset });
+            archive.zip.set_comment(note.to_string());
+            archive.geometry(geometry)
+        })
     })
 }
 
@@ -52,21 +51,84 @@ pub fn write_npz_matrices(path: &Path, matrices: &[(&str, usize, &[f32])]) -> Re
         return Err(Error::inconsistent(&path.display().to_string(), reason));
     }
     write_atomically(path, |file| {
-        let mut archive = Archive { zip: ZipWriter::new(file), compression: NpzCompression::Stored };
-        for (name, columns, values) in matrices {
-            archive.floats(name, *columns, values)?;
-        }
-        archive.zip.finish()?;
-        Ok(())
+        write_archive(file, NpzCompression::Stored, |archive| {
+            matrices.iter().try_for_each(|(name, columns, values)| archive.floats(name, *columns, values))
+        })
     })
 }
 
-struct Archive<'a> {
-    zip: ZipWriter<&'a mut AtomicWriter>,
+/// Writes the archive that `fill` fills.
+fn write_archive(
+    file: &mut AtomicWriter,
+    compression: NpzCompression,
+    fill: impl FnOnce(&mut Archive) -> io::Result<()>,
+) -> io::Result<()> {
+    let mut output = Output { file, position: 0, end: 0, error: None };
+    let filled = {
+        let mut archive = Archive { zip: ZipWriter::new(&mut output), compression };
+        let filled = fill(&mut archive);
+        let finished = archive.zip.finish().map(|_| ());
+        filled.and(finished.map_err(io::Error::from))
+    };
+    output.error.map_or(filled, Err)
+}
+
+/// A file that keeps its first error for the end and takes everything from then on: an archive whose writer fails tries
+/// to finish when it is dropped, and complains or panics when that fails, too.
+struct Output<'a> {
+    file: &'a mut AtomicWriter,
+    position: u64,
+    end: u64,
+    error: Option<io::Error>,
+}
+
+impl Output<'_> {
+    /// What `action` gives, or nothing where it or something before it failed.
+    fn attempt<T>(&mut self, action: impl FnOnce(&mut AtomicWriter) -> io::Result<T>) -> Option<T> {
+        if self.error.is_some() {
+            return None;
+        }
+        action(self.file).map_err(|error| self.error = Some(error)).ok()
+    }
+}
+
+impl Write for Output<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.attempt(|file| file.write_all(bytes));
+        self.position += bytes.len() as u64;
+        self.end = self.end.max(self.position);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.attempt(|file| file.flush());
+        Ok(())
+    }
+}
+
+impl Seek for Output<'_> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        let place = match to {
+            SeekFrom::Start(place) => Some(place),
+            SeekFrom::Current(by) => self.position.checked_add_signed(by),
+            SeekFrom::End(by) => self.end.checked_add_signed(by),
+        };
+        let before_start = || io::Error::new(io::ErrorKind::InvalidInput, "a place before the file's start");
+        let place = place.ok_or_else(before_start)?;
+        if place != self.position {
+            self.attempt(|file| file.seek(SeekFrom::Start(place)));
+            self.position = place;
+        }
+        Ok(place)
+    }
+}
+
+struct Archive<'a, 'f> {
+    zip: ZipWriter<&'a mut Output<'f>>,
     compression: NpzCompression,
 }
 
-impl Archive<'_> {
+impl Archive<'_, '_> {
     fn geometry(&mut self, geometry: &Geometry) -> io::Result<()> {
         self.floats("positions", 3, geometry.positions.as_flattened())?;
         if !geometry.normals.is_empty() {
