@@ -38,6 +38,9 @@ pub struct TrainingState {
     pub step: u64,
     /// Seconds spent in them.
     pub seconds: f64,
+    /// Seconds of these that went by before the first step; a schedule by the clock begins after them.
+    #[serde(default)]
+    pub prepared: f64,
     /// Whether the schedule has come to its end.
     pub finished: bool,
     /// Field evaluations, one stream each.

@@ -171,6 +171,7 @@ impl Trainer {
         let mut window = Window::new();
         if self.trained.progress.step == 0 {
             self.judge_poses();
+            self.trained.progress.prepared = before + start.elapsed().as_secs_f64();
         }
         while !self.trained.progress.finished {
             let fraction = self.fraction(budget);
@@ -241,7 +242,10 @@ impl Trainer {
     fn fraction(&self, budget: Option<Duration>) -> f64 {
         let p = &self.trained.progress;
         match budget {
-            Some(budget) => (p.seconds / budget.as_secs_f64()).min(1.0),
+            Some(budget) => {
+                let left = (budget.as_secs_f64() - p.prepared).max(1e-3);
+                ((p.seconds - p.prepared) / left).clamp(0.0, 1.0)
+            }
             None => (p.step as f64 / self.config.train.steps as f64).min(1.0),
         }
     }

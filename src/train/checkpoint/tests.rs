@@ -31,6 +31,7 @@ fn random(seed: u64) -> (Trained, Optimiser) {
         unexplained: Some(0.125),
         aligned: 2,
         joint: 0,
+        prepared: 0.5,
         trusts_poses: true,
         given_coverage: Some(0.25),
         stereo_from: Some((0..field.layout.refinement().len()).map(|n| 1.5e-3 * n as f32).collect()),
