@@ -171,7 +171,8 @@ impl Trainer {
         let mut window = Window::new();
         if self.trained.progress.step == 0 {
             self.judge_poses();
-            self.trained.progress.prepared = before + start.elapsed().as_secs_f64();
+            // Only a schedule by the clock needs to know; without one, checkpoints differ in nothing but `seconds`.
+            self.trained.progress.prepared = budget.map_or(0.0, |_| before + start.elapsed().as_secs_f64());
         }
         while !self.trained.progress.finished {
             let fraction = self.fraction(budget);
