@@ -161,6 +161,7 @@ impl Config {
             ("loss.transient_opacity", l.transient_opacity[0]),
             ("loss.transient_opacity", l.transient_opacity[1]),
             ("loss.moving", l.moving),
+            ("loss.veil", l.veil),
             ("loss.distortion", l.distortion),
             ("loss.entropy", l.entropy),
             ("loss.depth", l.depth),
@@ -205,9 +206,11 @@ impl Config {
                 && c.code <= 64
                 && c.knots <= 65536
                 && (c.time_levels == 0 || c.time_levels <= 8 && (1.0..=65536.0).contains(&c.time_finest))
+                && (0.0..=1.0).contains(&c.time_cells)
                 && c.density_bias.abs() <= 15.0;
             let remedy = "levels 1-16, log2_rows 1-24, 1 <= coarsest <= finest <= 65536, hidden 4-512, layers 1-8, \
                           code <= 64, knots <= 65536, time_levels <= 8, 1 <= time_finest <= 65536, \
+                          0 <= time_cells <= 1, \
                           density_bias within 15";
             range(key, format!("{c:?}"), ok, remedy)?;
         }

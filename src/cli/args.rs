@@ -74,7 +74,7 @@ pub struct DemoArgs {
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
     /// Time for training; the rest takes about a minute
-    #[arg(long, value_name = "TIME", default_value = "65s", value_parser = parse_duration)]
+    #[arg(long, value_name = "TIME", default_value = "90s", value_parser = parse_duration)]
     pub time_budget: Duration,
 }
 

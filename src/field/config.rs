@@ -24,8 +24,10 @@ pub struct StreamConfig {
     pub knots: usize,
     /// Lattices over space and time (dynamic, actor).
     pub time_levels: usize,
-    /// Cells along the longest side of the box at the finest of them; along time it has one cell for two frames.
+    /// Cells along the longest side of the box at the finest of them.
     pub time_finest: f32,
+    /// Cells along time at the finest of them, for every training frame.
+    pub time_cells: f32,
     /// Added to the raw density, so that training starts from a nearly empty box.
     pub density_bias: f32,
 }
@@ -59,6 +61,7 @@ impl Default for FieldConfig {
             knots: 0,
             time_levels: 0,
             time_finest: 0.0,
+            time_cells: 0.0,
             density_bias: -3.0,
         };
         let dynamic = StreamConfig {
@@ -69,6 +72,7 @@ impl Default for FieldConfig {
             knots: 16,
             time_levels: 2,
             time_finest: 64.0,
+            time_cells: 0.5,
             density_bias: -5.0,
             ..persistent.clone()
         };
@@ -77,9 +81,10 @@ impl Default for FieldConfig {
             coarsest: 8.0,
             finest: 64.0,
             log2_rows: 16,
-            knots: 70,
+            knots: 0,
             time_levels: 3,
             time_finest: 48.0,
+            time_cells: 1.0,
             ..dynamic.clone()
         };
         Self { persistent, dynamic, actor, actor_reach: 0.25, near: 0.015 }

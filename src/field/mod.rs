@@ -114,9 +114,9 @@ impl FieldShape {
         let c = self.config.stream(stream);
         let actor = stream == Stream::Actor;
         let extent = if actor { Vec3::ONE } else { self.normalisation.extent };
-        // A lattice point between two training frames that are farther apart than a cell would never be trained.
-        let frames = (0.5 * self.times.len() as f32).max(1.0);
-        let (coarsest, finest) = ([c.coarsest, 0.25 * frames], [c.time_finest, frames]);
+        let frames = self.times.len() as f32;
+        let cells = (c.time_cells * frames).max(1.0);
+        let (coarsest, finest) = ([c.coarsest, 0.125 * frames], [c.time_finest, cells]);
         HashGrid::new(extent, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows)
             .with_time(extent, c.time_levels, coarsest, finest, c.log2_rows)
     }
@@ -265,7 +265,7 @@ fn empty_tables(net: &StreamNet) -> Vec<Vec<Row>> {
 
 /// What degrees 3 and 4 of the view encoding are multiplied by: colours that change fast with the direction are learned slowly, and
 /// so only of what is seen from many directions. At full size, few views would be explained by them and not by geometry.
-pub const FAST_CHANGE: [f32; 2] = [0.3, 0.2];
+pub const FAST_CHANGE: [f32; 2] = [0.6, 0.5];
 
 /// Real spherical harmonics of degree 1 to 4 of a unit direction, without their constants' signs; degrees 3 and 4 times
 /// [`FAST_CHANGE`].

@@ -131,15 +131,15 @@ struct RayGrids<'a> {
 
 impl Steer for RayGrids<'_> {
     #[inline(always)]
-    fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
+    fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
         let Self { model, input, slices } = *self;
         let [persistent, dynamic, actor] = &model.grids.streams;
-        let mut sum = [0.0; STRIDE];
+        let [mut stands, mut moves] = [[0.0; STRIDE]; 2];
         if model.streams[0] {
-            persistent.add_at(points, slices[0], &mut sum);
+            persistent.add_at(points, slices[0], &mut stands);
         }
         if model.streams[1] {
-            dynamic.add_at(points, slices[1], &mut sum);
+            dynamic.add_at(points, slices[1], &mut moves);
         }
         let (z, far) = (input.dir_cam.z, model.field.actor_far);
         if model.streams[2] && t[0] * z < far {
@@ -150,10 +150,10 @@ impl Steer for RayGrids<'_> {
             let mut sigma = [0.0; STRIDE];
             actor.add_at(&points, slices[2], &mut sigma);
             for n in 0..STRIDE {
-                sum[n] += if t[n] * z < far { sigma[n] } else { 0.0 };
+                moves[n] += if t[n] * z < far { sigma[n] } else { 0.0 };
             }
         }
-        sum
+        [stands, moves]
     }
 }
 

@@ -9,6 +9,10 @@ const MAX_STEPS: usize = 768;
 /// A ray is cut off where less than this is left of its light.
 const SATURATED: f32 = 1e-4;
 
+/// Light that what moves leaves at least, as far as samples go: its grids hold for a span of time, in part of which it may
+/// be elsewhere, and then what is behind it must be looked at.
+const SEEN_PAST: f32 = 0.3;
+
 /// Settings of the sampler.
 #[derive(Clone, Copy, Debug)]
 pub struct Sampling {
@@ -22,12 +26,12 @@ pub struct Sampling {
     pub sharpness: f32,
 }
 
-/// What steers the samples of one ray: the sum of the streams' running densities along it.
+/// What steers the samples of one ray: the streams' running densities along it.
 ///
 /// A trait and not a closure, which would not be inlined, and so compiled without the caller's vector features.
 pub trait Steer {
-    /// σ at some points of the ray (x, y, z rows) and their distances.
-    fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE];
+    /// σ of what stands and of what moves, at some points of the ray (x, y, z rows) and their distances.
+    fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2];
 }
 
 /// Buffers of one thread.
@@ -60,7 +64,7 @@ impl Sampler {
         }
         let steps = (((end - start) / sampling.step).ceil() as usize).clamp(1, MAX_STEPS);
         let dt = (end - start) / steps as f32;
-        let mut left = 1.0f32;
+        let (mut left, mut past) = (1.0f32, 1.0f32);
         let mut total = 0.0;
         let mut used = 0;
         let scale = sampling.sharpness * dt;
@@ -75,15 +79,17 @@ impl Sampler {
                     points[axis][n] = ray.origin[axis] + ray.dir[axis] * t[n];
                 }
             }
-            let mut alpha = steer.sigma(&points, &t);
-            for a in &mut alpha {
-                let tau = *a * scale;
-                *a = tau / (1.0 + tau); // 1 - e^-tau to first order, and cheaper; only steers the samples
+            let [stands, moves] = steer.sigma(&points, &t);
+            let mut alphas = [[0.0; 3]; STRIDE];
+            for ((a, stands), moves) in alphas.iter_mut().zip(stands).zip(moves) {
+                // 1 - e^-tau to first order, and cheaper; only steers the samples.
+                *a = [stands + moves, stands, moves].map(|sigma| 1.0 - 1.0 / (1.0 + sigma * scale));
             }
-            for (w, alpha) in weights.iter_mut().zip(alpha) {
-                *w = left * alpha;
+            for (w, [alpha, stands, moves]) in weights.iter_mut().zip(alphas) {
+                *w = left * past.max(SEEN_PAST) * alpha;
                 total += *w;
-                left *= 1.0 - alpha;
+                left *= 1.0 - stands;
+                past *= 1.0 - moves;
                 used += 1;
                 if left < SATURATED {
                     break;

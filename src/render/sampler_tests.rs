@@ -17,8 +17,8 @@ fn ray(start: f32, end: f32) -> Ray {
 struct Along<F>(F);
 
 impl<F: Fn(f32) -> f32> Steer for Along<F> {
-    fn sigma(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
-        t.map(&self.0)
+    fn sigma(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
+        [t.map(&self.0), [0.0; STRIDE]]
     }
 }
 
@@ -85,4 +85,28 @@ fn extreme_densities_give_finite_edges() {
 fn a_ray_that_misses_the_box_places_nothing() {
     let mut edges = [0.0; 25];
     assert!(!Sampler::default().edges(&ray(1.0, 1.0), &SAMPLING, 0.5, &Along(|_| 1.0), &mut edges));
+}
+
+/// Density of what stands and of what moves.
+struct Two<F, G>(F, G);
+
+impl<F: Fn(f32) -> f32, G: Fn(f32) -> f32> Steer for Two<F, G> {
+    fn sigma(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
+        [t.map(&self.0), t.map(&self.1)]
+    }
+}
+
+#[test]
+fn what_is_behind_something_that_moves_is_looked_at_all_the_same() {
+    let slab = |at: f32| move |t: f32| if (at..at + 0.1).contains(&t) { 400.0 } else { 0.0 };
+    let mut edges = vec![f32::NAN; SAMPLING.count + 1];
+    let mut near = |from: f32| {
+        let hit =
+            Sampler::default().edges(&ray(0.0, 2.0), &SAMPLING, 0.5, &Two(slab(1.4), slab(0.5)), &mut edges);
+        assert!(hit);
+        edges.iter().filter(|t| (from - 0.03..from + 0.13).contains(*t)).count()
+    };
+    let (hand, wall) = (near(0.5), near(1.4));
+    assert!(hand > SAMPLING.count / 3, "{hand} edges at what moves");
+    assert!(wall >= SAMPLING.count / 8, "{wall} edges at what stands behind it");
 }

@@ -23,6 +23,7 @@ pub(crate) fn field_at(streams: [bool; 3], origin: DVec3) -> Field {
         knots: 0,
         time_levels: 0,
         time_finest: 16.0,
+        time_cells: 0.5,
         density_bias: -2.0,
     };
     let moving = StreamConfig { code: 4, knots: 4, time_levels: 2, ..small.clone() };

@@ -77,14 +77,14 @@ pub struct TrainConfig {
 impl Default for TrainConfig {
     fn default() -> Self {
         Self {
-            steps: 3600,
+            steps: 4600,
             rays: 4096,
             patch: 4,
             samples: 20,
             render_samples: 48,
             streams: StreamChoice::Auto,
             static_until: 0.15,
-            novelty: 0.5,
+            novelty: 0.3,
             time_spread: 1.0,
             table_rate: 3e-2,
             network_rate: 2e-3,

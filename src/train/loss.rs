@@ -13,6 +13,12 @@ pub mod flatness;
 /// Relative error of stereo depth that costs nothing.
 pub(super) const STEREO_ERROR: f32 = 0.01;
 
+/// How much more a pixel that the actor explains costs where things are that move: a hand may hold what it hides.
+const WHERE_THINGS_MOVE: f32 = 2.5;
+
+/// Share of the schedule from which veils cost something.
+const VEIL_FROM: f32 = 0.3;
+
 /// Relative error of depth from which on a ray's end is simply elsewhere.
 pub(super) const FAR_OFF: f32 = 0.08;
 
@@ -29,6 +35,9 @@ pub struct LossConfig {
     /// Price of persistent light where things are that move, though they may be at rest, in nats; dynamic light is free
     /// there. 0: what moves is not looked for.
     pub moving: f32,
+    /// Price of a pixel that the dynamic or the actor stream covers in part, at the schedule's end: times A (1 − A) of its
+    /// opacity A. What moves is opaque; a veil of its colour over what is behind it would do for the picture alone.
+    pub veil: f32,
     /// Distortion (Barron et al. 2022, mip-NeRF 360, eq. 15): pulls a ray's weight together.
     pub distortion: f32,
     /// Softness Σ_k T_k α_k (1 − α_k) of a ray: surfaces are hard, air is empty.
@@ -46,8 +55,9 @@ impl Default for LossConfig {
         Self {
             beta_min: 0.03,
             transient: 0.01,
-            transient_opacity: [8.0, 2.0],
+            transient_opacity: [8.0, 1.0],
             moving: 20.0,
+            veil: 6.0,
             distortion: 0.3,
             entropy: 0.0,
             depth: 4.0,
@@ -58,10 +68,16 @@ impl Default for LossConfig {
 }
 
 impl LossConfig {
+    /// The weights at the share `fraction` of the schedule: veils cost nothing while what moves takes form.
+    pub fn at(&self, fraction: f64) -> Self {
+        let ramp = ((fraction as f32 - VEIL_FROM) / (1.0 - VEIL_FROM)).clamp(0.0, 1.0);
+        Self { veil: self.veil * ramp, ..self.clone() }
+    }
+
     /// Price of explaining a pixel by each stream, in nats; `moving` where there are things that move.
     pub fn prices(&self, moving: bool) -> [f32; 3] {
         let [dynamic, actor] = self.transient_opacity;
-        if moving { [self.moving, 0.0, actor] } else { [0.0, dynamic, actor] }
+        if moving { [self.moving, 0.0, WHERE_THINGS_MOVE * actor] } else { [0.0, dynamic, actor] }
     }
 }
 
@@ -160,6 +176,9 @@ pub fn backward(
         let d_left = (0..3).map(|c| d_rgb[c] * target.background[c]).sum::<f32>();
         let exposure = target.exposure.iter().map(|e| e * e).sum::<f32>();
         let mut extra = 0.5 * config.exposure * exposure;
+        let cover = covers(&chunk.weighted[range.clone()]);
+        let veil = [0.0, 1.0, 1.0].map(|v| v * config.veil);
+        extra += (0..3).map(|s| veil[s] * cover[s] * (1.0 - cover[s])).sum::<f32>();
         for k in range.clone() {
             let prices = config.prices(moving.contains(ray.ray.at(chunk.intervals[k].t)));
             for s in 0..3 {
@@ -171,7 +190,7 @@ pub fn backward(
                     grad.samples[s].rgb[k][c] = d_rgb[c] * w;
                 }
                 extra += prices[s] * w;
-                g += scale * prices[s];
+                g += scale * (prices[s] + veil[s] * (1.0 - 2.0 * cover[s]));
                 if s > 0 {
                     g += d_beta * chunk.samples[s].beta[k];
                     grad.samples[s].beta[k] = d_beta * w;
@@ -241,6 +260,17 @@ pub fn backward(
         loss.total += f64::from(extra);
     }
     loss
+}
+
+/// Opacity of each stream along a ray.
+fn covers(weighted: &[Weighted]) -> [f32; 3] {
+    let mut cover = [0.0; 3];
+    for w in weighted {
+        for s in 0..3 {
+            cover[s] += w.weight[s];
+        }
+    }
+    cover
 }
 
 /// How wrong it is for a ray to end at `t` where stereo says `depth`, 0 to 1: nothing within its error, and no more

@@ -3,7 +3,7 @@
 //! With pixels drawn evenly, what a video passes in three frames gets a hundredth of the rays of what it shows all the time,
 //! and its surface stays where the first fog was.
 
-use glam::DVec2;
+use glam::{DAffine3, DVec2};
 use rayon::prelude::*;
 
 use crate::rng::Rng;
@@ -29,12 +29,13 @@ pub struct Novelty {
 
 impl Novelty {
     /// `share` of the rays go to cells by how few frames show what is there, the others evenly; `size` is that of the scene, in
-    /// world units.
+    /// world units. With a share of 0 nobody looks what frames show.
     pub fn new(frames: &[Frame], size: f64, share: f64) -> Self {
         let every = frames.len().div_ceil(OTHERS).max(1);
-        let others: Vec<&Frame> = frames.iter().step_by(every).collect();
+        let others: Vec<Other> = frames.iter().step_by(every).map(|f| (f, f.c2w.inverse())).collect();
         let rarity = |frame: &Frame| -> Vec<f64> {
-            (0..CELLS[0] * CELLS[1]).map(|cell| rarity(frame, cell, &others, size)).collect()
+            let cells = 0..CELLS[0] * CELLS[1];
+            cells.map(|cell| if share > 0.0 { rarity(frame, cell, &others, size) } else { 1.0 }).collect()
         };
         let rarity: Vec<f64> = frames.par_iter().map(rarity).collect::<Vec<_>>().concat();
         let mean = rarity.iter().sum::<f64>() / rarity.len().max(1) as f64;
@@ -65,16 +66,19 @@ impl Novelty {
     }
 }
 
+/// A frame, and world to camera.
+type Other<'a> = (&'a Frame, DAffine3);
+
 /// One over the number of frames that show what is in the middle of a cell, at some distances; mean over those.
-fn rarity(frame: &Frame, cell: usize, others: &[&Frame], size: f64) -> f64 {
+fn rarity(frame: &Frame, cell: usize, others: &[Other], size: f64) -> f64 {
     let camera = &frame.camera;
     let middle = DVec2::new((cell % CELLS[0]) as f64 + 0.5, (cell / CELLS[0]) as f64 + 0.5);
     let uv = middle / DVec2::new(CELLS[0] as f64, CELLS[1] as f64)
         * DVec2::new(f64::from(camera.width), f64::from(camera.height));
     let of = |distance: &f64| {
         let point = frame.c2w.transform_point3(camera.unproject(uv) * (distance * size));
-        let shows = |other: &&&Frame| {
-            let at = other.c2w.inverse().transform_point3(point);
+        let shows = |(other, w2c): &&Other| {
+            let at = w2c.transform_point3(point);
             let (width, height) = (f64::from(other.camera.width), f64::from(other.camera.height));
             other.camera.project(at).is_some_and(|p| p.x >= 0.0 && p.y >= 0.0 && p.x < width && p.y < height)
         };

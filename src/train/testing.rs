@@ -108,6 +108,7 @@ pub fn config() -> Config {
             code,
             knots,
             time_finest: 12.0,
+            time_cells: 0.5,
             density_bias: 0.5,
             ..c.clone()
         };

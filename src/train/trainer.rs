@@ -292,7 +292,8 @@ impl Trainer {
             (plan.pose_rate, plan.rig_rate) = (0.0, 0.0);
         }
         let Config { loss, seed, .. } = &self.config;
-        let report = self.optimiser.step(field, grids, &self.pixels, loss, &plan, *seed, companion);
+        let report =
+            self.optimiser.step(field, grids, &self.pixels, &loss.at(fraction), &plan, *seed, companion);
         let non_finite = |stage, index| TrainError::NonFinite { stage, step: progress.step, index };
         if let Some(chunk) = report.diverged {
             return Err(non_finite("the loss of a chunk of rays", chunk));
@@ -457,12 +458,12 @@ fn load(scene: &Scene, config: &Config) -> Result<(PixelSet, PixelSet), TrainErr
     let of =
         |split: Split| -> Vec<Frame> { scene.frames.iter().filter(|f| f.split == split).cloned().collect() };
     let size = (scene.bounds.max - scene.bounds.min).length();
-    let load = |split| PixelSet::load(of(split), size, config.train.novelty);
-    let pixels = load(Split::Train)?;
+    let load = |split, novelty| PixelSet::load(of(split), size, novelty);
+    let pixels = load(Split::Train, config.train.novelty)?;
     if !pixels.has_usable() {
         return Err(TrainError::NoPixels);
     }
-    Ok((pixels, load(Split::Test)?))
+    Ok((pixels, load(Split::Test, 0.0)?))
 }
 
 /// The masks that tell what moves, where that is asked.

@@ -53,6 +53,7 @@ pub(super) fn trace(seed: u64) -> Traced {
 fn weighed() -> LossConfig {
     LossConfig {
         transient: 1.0,
+        veil: 20.0,
         distortion: 40.0,
         entropy: 5.0,
         flatness: 12.0,
@@ -366,11 +367,12 @@ fn a_group_without_gradient_is_found() {
 #[test]
 fn a_term_that_is_off_by_one_per_cent_is_found() {
     let traced = trace(seeds().next().expect("there is one"));
-    let wrong: [fn(&mut LossConfig); 9] = [
+    let wrong: [fn(&mut LossConfig); 10] = [
         |c| c.beta_min *= 1.01,
         |c| c.transient *= 1.01,
         |c| c.transient_opacity[0] *= 1.01,
         |c| c.transient_opacity[1] *= 1.01,
+        |c| c.veil *= 1.01,
         |c| c.depth *= 1.01,
         |c| c.flatness *= 1.01,
         |c| c.distortion *= 1.01,

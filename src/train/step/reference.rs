@@ -94,7 +94,7 @@ impl Reference<'_> {
         let mut light = 1.0;
         let mut weights = Vec::new();
         let (mut rgb, mut beta, mut transient, mut entropy) = ([0.0; 3], f64::from(c.beta_min), 0.0, 0.0);
-        let mut price = 0.0;
+        let (mut price, mut cover) = (0.0, [0.0; 3]);
         for (i, sample) in intervals.iter().zip(samples) {
             let delta = f64::from(i.delta);
             let sum: f64 = sample.iter().map(|s| s.sigma).sum();
@@ -112,6 +112,7 @@ impl Reference<'_> {
                     transient += sample.sigma * delta;
                 }
                 price += f64::from(prices[s]) * w;
+                cover[s] += w;
             }
             let (t, depth) = (f64::from(i.t), f64::from(self.targets[r].depth));
             if depth > 0.0 {
@@ -140,6 +141,7 @@ impl Reference<'_> {
         0.5 * squared / (beta * beta)
             + beta.ln()
             + price
+            + f64::from(c.veil) * cover[1..].iter().map(|a| a * (1.0 - a)).sum::<f64>()
             + f64::from(c.transient) * transient
             + f64::from(c.distortion) * distortion
             + f64::from(c.entropy) * entropy
