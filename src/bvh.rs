@@ -146,6 +146,35 @@ impl TriangleBvh {
         (best.1 != u32::MAX).then(|| Nearest { distance: best.0.sqrt(), triangle: best.1 })
     }
 
+    /// Whether a point of the surface is at most `distance` from the query.
+    pub fn within(&self, query: Vec3, distance: f32) -> bool {
+        let (query, limit) = (Vec3A::from(query), distance * distance);
+        let mut stack = [0u32; STACK];
+        let mut depth = usize::from(!self.nodes.is_empty());
+        while depth > 0 {
+            depth -= 1;
+            let index = stack[depth];
+            let node = &self.nodes[index as usize];
+            if node.count > 0 {
+                let mut leaf = self.corners[node.first as usize..(node.first + node.count) as usize].iter();
+                if leaf.any(|corners| distance_squared(query, corners.map(Vec3A::from)) <= limit) {
+                    return true;
+                }
+                continue;
+            }
+            let left = (self.box_distance(index + 1, query), index + 1);
+            let right = (self.box_distance(node.first, query), node.first);
+            let (near, far) = if left.0 <= right.0 { (left, right) } else { (right, left) };
+            for (box_distance, child) in [far, near] {
+                if box_distance <= limit {
+                    stack[depth] = child;
+                    depth += 1;
+                }
+            }
+        }
+        false
+    }
+
     /// The first triangle that a ray meets with `t_min < t < t_max`, from either side.
     pub fn first_hit(&self, origin: Vec3, dir: Vec3, t_min: f32, t_max: f32) -> Option<Hit> {
         self.cast::<false>(origin, dir, t_min, t_max)
@@ -320,6 +349,9 @@ fn best_boundary(items: &[Item], bin: impl Fn(&Item) -> usize) -> usize {
     best.1
 }
 
+/// A triangle is a sliver if the squared sine between two of its sides is smaller: a hundred times the rounding of f32.
+const SLIVER: f32 = 1e-5;
+
 /// Squared distance from `p` to a triangle (Ericson, Real-Time Collision Detection, 5.1.5).
 fn distance_squared(p: Vec3A, [a, b, c]: [Vec3A; 3]) -> f32 {
     let (ab, ac, ap) = (b - a, c - a, p - a);
@@ -349,18 +381,20 @@ fn distance_squared(p: Vec3A, [a, b, c]: [Vec3A; 3]) -> f32 {
     if va <= 0.0 && d4 - d3 >= 0.0 && d5 - d6 >= 0.0 {
         return (bp - (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))).length_squared();
     }
-    let inside = (ap - ab * (vb / (va + vb + vc)) - ac * (vc / (va + vb + vc))).length_squared();
-    if inside.is_finite() {
+    let double_area2 = va + vb + vc;
+    let inside = (ap - ab * (vb / double_area2) - ac * (vc / double_area2)).length_squared();
+    if double_area2 > SLIVER * ab.length_squared() * ac.length_squared() {
         return inside;
     }
-    // A sliver whose area rounds to zero is its edges.
+    // Of a sliver the weights may be nothing but rounding; a point of an edge can then be nearer.
     let edge = |s: Vec3A, e: Vec3A| {
         let (along, to) = (e - s, p - s);
         let length2 = along.length_squared();
         let t = if length2 > 0.0 { (to.dot(along) / length2).clamp(0.0, 1.0) } else { 0.0 };
         (to - along * t).length_squared()
     };
-    edge(a, b).min(edge(b, c)).min(edge(c, a))
+    // `min` passes over a NaN.
+    inside.min(edge(a, b)).min(edge(b, c)).min(edge(c, a))
 }
 
 /// Ray parameter and barycentric weights (Möller & Trumbore 1997), both sides of the triangle.

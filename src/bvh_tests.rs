@@ -80,3 +80,42 @@ fn rays_along_the_lattice_of_a_wall_hit_it() {
         }
     }
 }
+
+#[test]
+fn slivers_are_no_farther_than_their_edges() {
+    // Collinear corners on a lattice of thirds: their area is nothing but rounding.
+    let mut rng = Rng::new(5, 0, 0);
+    for _ in 0..20_000 {
+        let mut lattice = || Vec3::from([0; 3].map(|_| (rng.uniform() * 4.0).floor() / 12.0));
+        let (a, step) = (lattice(), lattice());
+        let corners = [a, a + step, a + step * 2.0];
+        let p = a.lerp(corners[2], rng.uniform());
+        let distance = TriangleBvh::new(1, |_| corners).nearest(p).unwrap().distance;
+        assert!(distance < 1e-6, "{distance} from {p} to {corners:?}");
+    }
+}
+
+#[test]
+fn what_is_within_is_what_the_nearest_point_says() {
+    let mut rng = Rng::new(3, 0, 0);
+    let point = |rng: &mut Rng| Vec3::from([0; 3].map(|_| rng.uniform()));
+    let triangles: Vec<[Vec3; 3]> = (0..500)
+        .map(|_| {
+            let p = point(&mut rng);
+            [p, p + 0.2 * point(&mut rng), p + 0.2 * point(&mut rng)]
+        })
+        .collect();
+    let bvh = TriangleBvh::new(triangles.len(), |i| triangles[i]);
+    let mut inside = 0;
+    for _ in 0..2000 {
+        let (p, limit) = (point(&mut rng) * 1.4 - 0.2, 0.2 * rng.uniform());
+        let distance = bvh.nearest(p).unwrap().distance;
+        inside += usize::from(distance <= limit);
+        // Squares may round to either side of the limit.
+        if (distance - limit).abs() > 1e-6 {
+            assert_eq!(bvh.within(p, limit), distance <= limit, "{p}");
+        }
+    }
+    assert!((200..1800).contains(&inside), "the test must see both: {inside}");
+    assert!(!TriangleBvh::new(0, |_| [Vec3::ZERO; 3]).within(Vec3::ZERO, 1.0));
+}

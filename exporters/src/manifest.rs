@@ -132,7 +132,7 @@ pub struct SimplifiedEntry {
     pub triangles_after: usize,
     /// Parts that were triangulated on their own.
     pub patches: usize,
-    /// Parts among them that kept all their triangles.
+    /// Parts among them that were not: too small, or not within the tolerances; edges may have collapsed there.
     pub kept_patches: usize,
     /// Attributes that had to stay within a tolerance.
     pub deviations: Vec<DeviationEntry>,

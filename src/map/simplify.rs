@@ -7,7 +7,7 @@ use super::build::{Progress, Stage};
 use super::config::{MapConfig, Simplify};
 use super::{MapError, SemanticMap};
 use crate::extract::TriMesh;
-use crate::extract::simplify::{Column, simplify as simplify_mesh};
+use crate::extract::simplify::{Column, simplify_watched};
 
 /// Simplifies every mesh of the map as `config` says and notes in `map.simplified` what came of it; the cloud keeps its
 /// points. To be called when all attributes are there: those that are added later would not be looked at.
@@ -21,10 +21,17 @@ pub fn simplify(
 ) -> Result<(), MapError> {
     config.validate()?;
     let Simplify::Within(tolerance) = config.simplify else { return Ok(()) };
-    let total = map.geometries.len();
-    for (done, geometry) in map.geometries.iter_mut().enumerate() {
-        progress(Progress { stage: Stage::Simplify, done, total });
-        map.simplified.push(simplify_geometry(geometry, tolerance, config)?);
+    // In triangles: one mesh has most of them.
+    let total = map.geometries.iter().map(|g| g.triangles.len()).sum();
+    let mut before = 0;
+    for geometry in &mut map.geometries {
+        let triangles = geometry.triangles.len();
+        let mut part = |share: f32| {
+            let done = before + (f64::from(share) * triangles as f64) as usize;
+            progress(Progress { stage: Stage::Simplify, done, total });
+        };
+        map.simplified.push(simplify_geometry(geometry, tolerance, config, &mut part)?);
+        before += triangles;
     }
     progress(Progress { stage: Stage::Simplify, done: total, total });
     Ok(())
@@ -34,6 +41,7 @@ fn simplify_geometry(
     geometry: &mut Geometry,
     tolerance: f64,
     config: &MapConfig,
+    progress: &mut dyn FnMut(f32),
 ) -> Result<SimplifiedEntry, MapError> {
     let bounded = bounded_columns(geometry, config);
     let mesh = TriMesh {
@@ -41,7 +49,7 @@ fn simplify_geometry(
         triangles: std::mem::take(&mut geometry.triangles),
     };
     let columns: Vec<Column> = bounded.iter().map(Bounded::column).collect();
-    let done = simplify_mesh(&mesh, &columns, tolerance as f32);
+    let done = simplify_watched(&mesh, &columns, tolerance as f32, progress);
     let done = done.map_err(MapError::extract(&geometry.name))?;
     let deviations = bounded.iter().zip(&done.report.deviations).map(|(column, &largest)| DeviationEntry {
         name: column.name.clone(),
@@ -173,7 +181,7 @@ mod tests {
         let within = |simplify_color, simplify_score| {
             let mut geometry = square();
             let config = MapConfig { simplify_color, simplify_score, ..MapConfig::default() };
-            let entry = simplify_geometry(&mut geometry, 0.01, &config).unwrap();
+            let entry = simplify_geometry(&mut geometry, 0.01, &config, &mut |_| {}).unwrap();
             (geometry, entry)
         };
         let (free, _) = within(1e3, 1e3);

@@ -4,19 +4,7 @@ use glam::{Vec3, Vec3A};
 use rayon::prelude::*;
 
 use crate::bvh::TriangleBvh;
-use crate::extract::TriMesh;
 
-/// Barycentric weights at which a triangle of the original is looked at: corners, middles of the sides, centre. The
-/// difference of two triangulated surfaces is largest at corners and where edges cross.
-const PLACES: [[f32; 3]; 7] = [
-    [1.0, 0.0, 0.0],
-    [0.0, 1.0, 0.0],
-    [0.0, 0.0, 1.0],
-    [0.5, 0.5, 0.0],
-    [0.0, 0.5, 0.5],
-    [0.5, 0.0, 0.5],
-    [1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0],
-];
 /// A triangle is not looked at in more than this many steps along a side.
 const MOST_STEPS: usize = 64;
 
@@ -29,47 +17,37 @@ impl Surface {
         Self(TriangleBvh::new(triangles.len(), corners))
     }
 
-    /// Distance to the surface and the triangle that is nearest.
-    fn nearest(&self, p: Vec3A) -> (f32, u32) {
-        self.0.nearest(p.into()).map_or((f32::INFINITY, u32::MAX), |n| (n.distance, n.triangle))
+    pub(super) fn is_within(&self, p: Vec3A, distance: f32) -> bool {
+        self.0.within(p.into(), distance)
+    }
+
+    /// Whether all places of a triangle's raster are at most `distance` from the surface.
+    pub(super) fn holds(&self, corners: [Vec3A; 3], spacing: f32, distance: f32) -> bool {
+        raster(corners, spacing).all(|p| self.is_within(p, distance))
+    }
+
+    /// The triangles of the surface that are nearest to places of a triangle farther than `distance` from it.
+    pub(super) fn beyond(&self, corners: [Vec3A; 3], spacing: f32, distance: f32) -> Vec<u32> {
+        let far = raster(corners, spacing).filter(|&p| !self.is_within(p, distance));
+        far.filter_map(|p| Some(self.0.nearest(p.into())?.triangle)).collect()
+    }
+
+    fn distance(&self, p: Vec3A) -> f32 {
+        self.0.nearest(p.into()).map_or(f32::INFINITY, |n| n.distance)
     }
 }
 
-/// The largest distance of each of some triangles of the original to the new surface.
-pub(super) fn old_to_new(mesh: &TriMesh, which: &[u32], new: &Surface) -> Vec<f32> {
-    let one = |&t: &u32| {
-        let corners = mesh.corners(t as usize);
-        let places = PLACES.iter().map(|w| corners[0] * w[0] + corners[1] * w[1] + corners[2] * w[2]);
-        places.map(|p| new.nearest(p).0).fold(0.0, f32::max)
-    };
-    which.par_iter().map(one).collect()
+/// Places of a triangle, in at least two steps a side, each of `spacing` at most; without its corners.
+pub(super) fn raster([a, b, c]: [Vec3A; 3], spacing: f32) -> impl Iterator<Item = Vec3A> {
+    let longest = a.distance(b).max(b.distance(c)).max(c.distance(a));
+    let steps = ((longest / spacing).ceil() as usize).clamp(2, MOST_STEPS);
+    let inner = move |&(i, j): &(usize, usize)| i != steps && j != steps && i + j != 0;
+    let all = (0..=steps).flat_map(move |i| (0..=steps - i).map(move |j| (i, j)));
+    let share = move |n: usize| n as f32 / steps as f32;
+    all.filter(inner).map(move |(i, j)| a + (b - a) * share(i) + (c - a) * share(j))
 }
 
-/// The largest distance of each of some new triangles to the original, looked at in steps of `spacing` at most, and the
-/// triangles of the original that are nearest to the places that are farther than `tolerance`.
-pub(super) fn new_to_old(
-    positions: &[[f32; 3]],
-    triangles: &[[u32; 3]],
-    old: &Surface,
-    spacing: f32,
-    tolerance: f32,
-) -> Vec<(f32, Vec<u32>)> {
-    let one = |t: &[u32; 3]| {
-        let [a, b, c] = t.map(|v| Vec3A::from_array(positions[v as usize]));
-        let longest = a.distance(b).max(b.distance(c)).max(c.distance(a));
-        let steps = ((longest / spacing).ceil() as usize).clamp(2, MOST_STEPS);
-        let (mut largest, mut beyond) = (0.0f32, Vec::new());
-        for i in 0..=steps {
-            for j in 0..=steps - i {
-                let (u, v) = (i as f32 / steps as f32, j as f32 / steps as f32);
-                let (distance, nearest) = old.nearest(a + (b - a) * u + (c - a) * v);
-                largest = largest.max(distance);
-                if distance > tolerance && beyond.last() != Some(&nearest) {
-                    beyond.push(nearest);
-                }
-            }
-        }
-        (largest, beyond)
-    };
-    triangles.par_iter().map(one).collect()
+/// The largest distance of places to a surface.
+pub(super) fn farthest(places: impl ParallelIterator<Item = Vec3A>, surface: &Surface) -> f32 {
+    places.map(|p| surface.distance(p)).reduce(|| 0.0, f32::max)
 }

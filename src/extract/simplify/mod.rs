@@ -1,24 +1,28 @@
 //! Fewer triangles within a stated error.
 //!
 //! ```text
-//! triangles ─ regions (patches: height fields over a plane) ─ chains (their common rims, simplified once)
-//!                  ┌───────────────────────────────────────────────┘
-//!                sheet (constrained Delaunay triangulation of each rim) ─ refine (greedy insertion) ─ measure
-//!                  └────────────────── what failed bends less, or stays as it was ──────────────────────┘
+//! triangles ─ regions (patches: height fields over a plane)
+//!               └─ patches (constrained Delaunay triangulation of each rim: sheet; greedy insertion: refine)
+//!                    └─ passes (edges collapse, cubes of the surface at a time)
 //! ```
 //!
-//! The vertices that are left are some of the mesh's own, so their attributes stay as they are. Neighbouring patches
-//! share their rim's vertices, so a closed mesh stays closed, and a manifold one manifold. The result is checked by
-//! measuring: no place of either surface that was looked at is farther from the other than the tolerance.
+//! The vertices that are left are some of the mesh's own, so their attributes stay as they are. Patches and cubes are worked
+//! on apart, and each keeps its rim, so a closed mesh stays closed, and a manifold one manifold; the next pass has its rims
+//! elsewhere. At every step each triangle knows which samples of the original (vertices, middles of sides, centres) lie over
+//! it, and a step is only taken if these stay within the tolerance of it, and the places of its raster within the tolerance
+//! of the original: that both surfaces are close to each other need not be repaired afterwards, only measured.
 
-mod chains;
+mod collapse;
 mod columns;
-mod homes;
+mod cover;
 mod measure;
 mod overlaps;
+mod passes;
+mod patches;
+mod quadric;
 mod refine;
 mod regions;
-mod rounds;
+mod scene;
 mod sheet;
 #[cfg(test)]
 mod tests;
@@ -26,7 +30,6 @@ mod topology;
 
 pub use self::columns::Column;
 use self::columns::Rows;
-use self::rounds::Rounds;
 use super::{ExtractError, TriMesh};
 
 /// A mesh with fewer triangles.
@@ -49,7 +52,7 @@ pub struct SimplifyReport {
     pub triangles_after: usize,
     /// Patches that the mesh was divided into.
     pub patches: usize,
-    /// Patches that kept all their triangles because no simpler ones stayed within the tolerances, or at all.
+    /// Patches among them that were left to the collapses alone: too small, or not to be triangulated within the tolerances.
     pub kept_patches: usize,
     /// Largest distance found between the two surfaces, looked at from both sides, world units.
     pub max_distance: f32,
@@ -66,6 +69,19 @@ pub struct SimplifyReport {
 /// `Invalid` for a tolerance or a column that makes no sense or a triangle without its vertices, `Length` for a column
 /// of another length, `NonFinite` for positions and attributes (by index) that are not finite.
 pub fn simplify(mesh: &TriMesh, columns: &[Column], tolerance: f32) -> Result<Simplified, ExtractError> {
+    simplify_watched(mesh, columns, tolerance, &mut |_| {})
+}
+
+/// As [`simplify`]; `progress` hears the share of the work that is done, from time to time.
+///
+/// # Errors
+/// Those of [`simplify`].
+pub fn simplify_watched(
+    mesh: &TriMesh,
+    columns: &[Column],
+    tolerance: f32,
+    progress: &mut dyn FnMut(f32),
+) -> Result<Simplified, ExtractError> {
     let sane = tolerance.is_finite() && tolerance >= 0.0;
     ExtractError::require(sane, "simplification tolerance", tolerance, "a length from 0")?;
     if let Some(index) = mesh.positions.iter().position(|p| p.iter().any(|x| !x.is_finite())) {
@@ -78,7 +94,7 @@ pub fn simplify(mesh: &TriMesh, columns: &[Column], tolerance: f32) -> Result<Si
     if tolerance == 0.0 || mesh.triangles.is_empty() {
         return Ok(unchanged(mesh, columns.len()));
     }
-    Ok(Rounds::new(mesh, &rows, tolerance).run())
+    Ok(passes::run(mesh, &rows, tolerance, progress))
 }
 
 fn unchanged(mesh: &TriMesh, columns: usize) -> Simplified {

@@ -2,7 +2,7 @@
 //!
 //! A patch is a height field over its plane, so it may undulate; what it may not do is turn away from the plane. Grown
 //! from the flattest places outwards (region growing, as in Cohen-Steiner et al., "Variational shape approximation",
-//! 2004, without the iterations), then its ragged rim is evened out.
+//! 2004, without the iterations).
 
 use std::collections::VecDeque;
 
@@ -15,7 +15,7 @@ use crate::extract::TriMesh;
 use crate::extract::clean::vertex_normals;
 
 /// No patch.
-pub(super) const NONE: u32 = u32::MAX;
+const NONE: u32 = u32::MAX;
 /// Not yet seen to belong to a part.
 const WAITING: u32 = NONE - 1;
 /// Smoothed normals of a patch are within this angle of its plane's: cos 50°.
@@ -26,10 +26,6 @@ const FACING: f32 = 0.2;
 const SEED_TRIANGLES: usize = 400;
 /// A patch has no more triangles: patches are the unit of parallel work, and of what is kept where one fails.
 const MOST_TRIANGLES: usize = 12_000;
-/// A patch with fewer goes to its neighbours where they face it.
-const FEW_TRIANGLES: usize = 24;
-/// Passes that even out rims and dissolve what is small.
-const PASSES: usize = 4;
 /// Passes that take apart what lies over itself, one triangle's width each.
 const PARTINGS: usize = 64;
 
@@ -52,65 +48,24 @@ impl Frame {
     }
 
     /// Place in the plane and height above it.
-    pub(super) fn project(&self, p: [f32; 3]) -> (DVec2, f64) {
-        let d = Vec3A::from_array(p).as_dvec3() - self.origin;
+    pub(super) fn project(&self, p: Vec3A) -> (DVec2, f64) {
+        let d = p.as_dvec3() - self.origin;
         (DVec2::new(d.dot(self.u), d.dot(self.v)), d.dot(self.u.cross(self.v)))
     }
 }
 
 /// The patches of a mesh.
 pub(super) struct Regions {
-    /// Patch of each triangle; [`NONE`] for those without area.
-    pub(super) of: Vec<u32>,
     /// Triangles of each patch, in rising order.
     pub(super) members: Vec<Vec<u32>>,
     pub(super) frames: Vec<Frame>,
 }
 
 impl Regions {
-    /// Divides a patch into connected parts with at most half of its triangles. The first part keeps its number; the
-    /// others get new ones, which are returned.
-    pub(super) fn split(&mut self, topology: &Topology, patch: u32) -> std::ops::Range<u32> {
-        let first_new = self.members.len() as u32;
-        let whole = std::mem::take(&mut self.members[patch as usize]);
-        let most = whole.len().div_ceil(2);
-        whole.iter().for_each(|&t| self.of[t as usize] = WAITING);
-        for &seed in &whole {
-            if self.of[seed as usize] != WAITING {
-                continue;
-            }
-            let label =
-                if self.members[patch as usize].is_empty() { patch } else { self.members.len() as u32 };
-            let (of, mut left) = (&mut self.of, most);
-            let mut part = connected(topology, seed, |t| {
-                let takes = of[t as usize] == WAITING && left > 0;
-                if takes {
-                    left -= 1;
-                    of[t as usize] = label;
-                }
-                takes
-            });
-            part.sort_unstable();
-            if label == patch {
-                self.members[patch as usize] = part;
-            } else {
-                self.members.push(part);
-                self.frames.push(self.frames[patch as usize]);
-            }
-        }
-        first_new..self.members.len() as u32
-    }
-
     pub(super) fn grow(mesh: &TriMesh, topology: &Topology) -> Self {
         let mut grower = Grower::new(mesh, topology);
         let seeds = grower.seeds();
-        grower.grow_all(&seeds, CONE);
-        // What is crumpled makes patches of its own, as large as they get.
-        grower.release_small();
-        grower.grow_all(&seeds, FACING);
-        for _ in 0..PASSES {
-            grower.even_out();
-        }
+        grower.grow_all(&seeds);
         grower.part_overlaps();
         grower.finish()
     }
@@ -157,32 +112,25 @@ impl<'a> Grower<'a> {
     }
 
     /// Grows patches from all of these triangles that are free.
-    fn grow_all(&mut self, seeds: &[u32], cone: f32) {
+    fn grow_all(&mut self, seeds: &[u32]) {
         for &seed in seeds {
             if self.of[seed as usize] == NONE {
-                self.grow_from(seed, cone);
+                self.grow_from(seed);
             }
         }
     }
 
-    /// Frees the triangles of patches with few of them.
-    fn release_small(&mut self) {
-        for part in self.members().iter().filter(|part| part.len() < FEW_TRIANGLES) {
-            part.iter().for_each(|&t| self.of[t as usize] = NONE);
-        }
-    }
-
-    fn grow_from(&mut self, seed: u32, cone: f32) {
+    fn grow_from(&mut self, seed: u32) {
         let start = self.smooth[seed as usize];
         let start =
             if start.dot(self.own[seed as usize]) >= FACING { start } else { self.own[seed as usize] };
-        let around = self.reach(seed, start, cone.sqrt(), SEED_TRIANGLES);
+        let around = self.reach(seed, start, CONE.sqrt(), SEED_TRIANGLES);
         let mean: Vec3A = around.iter().map(|&t| self.mesh.area_normal(t as usize)).sum();
         let mean = mean.try_normalize().unwrap_or(start);
         let normal = if mean.dot(self.own[seed as usize]) >= FACING { mean } else { start };
         let patch = self.normals.len() as u32;
         self.normals.push(normal);
-        for t in self.reach(seed, normal, cone, MOST_TRIANGLES) {
+        for t in self.reach(seed, normal, CONE, MOST_TRIANGLES) {
             self.of[t as usize] = patch;
         }
     }
@@ -213,35 +161,7 @@ impl<'a> Grower<'a> {
         found
     }
 
-    /// Triangles move to the patch that most of their neighbours belong to, or that can take in a small patch.
-    fn even_out(&mut self) {
-        let mut size = vec![0usize; self.normals.len()];
-        self.of.iter().filter(|&&p| p != NONE).for_each(|&p| size[p as usize] += 1);
-        for t in 0..self.of.len() {
-            let here = self.of[t];
-            if here == NONE {
-                continue;
-            }
-            let beside: Vec<u32> = self.topology.neighbours(t as u32).map(|n| self.of[n as usize]).collect();
-            let count = |p: u32| beside.iter().filter(|&&b| b == p).count();
-            let small = size[here as usize] < FEW_TRIANGLES;
-            let takes = |p: &&u32| {
-                let larger = size[**p as usize] > size[here as usize];
-                **p != here
-                    && self.own[t].dot(self.normals[**p as usize]) >= FACING
-                    && (count(**p) >= 2 || small && larger)
-            };
-            let best = beside.iter().filter(takes).max_by_key(|&&p| (count(p), size[p as usize], p));
-            if let Some(&p) = best {
-                size[here as usize] -= 1;
-                size[p as usize] += 1;
-                self.of[t] = p;
-            }
-        }
-    }
-
-    /// Takes triangles out of patches that lie over themselves, from the rim inwards, until none does; these make new
-    /// patches.
+    /// Takes triangles out of patches that lie over themselves, from the rim inwards, until none does.
     fn part_overlaps(&mut self) {
         let mut changed: Vec<u32> = (0..self.normals.len() as u32).collect();
         for _ in 0..PARTINGS {
@@ -252,9 +172,6 @@ impl<'a> Grower<'a> {
             }
             changed = out.iter().map(|&t| self.of[t as usize]).collect();
             out.iter().for_each(|&t| self.of[t as usize] = NONE);
-            let old = self.normals.len() as u32;
-            self.grow_all(&out, FACING);
-            changed.extend(old..self.normals.len() as u32);
             changed.sort_unstable();
             changed.dedup();
         }
@@ -315,7 +232,10 @@ impl<'a> Grower<'a> {
             .collect();
         let to_plane = |&(t, k): &(u32, usize)| {
             let vertices = side(&self.mesh.triangles[t as usize], k);
-            RimSide { vertices, ends: vertices.map(|v| frame.project(self.mesh.positions[v as usize]).0) }
+            RimSide {
+                vertices,
+                ends: vertices.map(|v| frame.project(Vec3A::from_array(self.mesh.positions[v as usize])).0),
+            }
         };
         let sides: Vec<RimSide> = rim.iter().map(to_plane).collect();
         // Round the end of a side, through the patch, to the side where the rim goes on.
@@ -345,10 +265,9 @@ impl<'a> Grower<'a> {
 
     /// The patches as they are, without empty ones.
     fn finish(self) -> Regions {
-        let mut regions = Regions { of: vec![NONE; self.of.len()], members: Vec::new(), frames: Vec::new() };
+        let mut regions = Regions { members: Vec::new(), frames: Vec::new() };
         for (label, part) in self.members().into_iter().enumerate().filter(|(_, part)| !part.is_empty()) {
             let origin = self.mesh.corners(part[0] as usize)[0].as_dvec3();
-            part.iter().for_each(|&t| regions.of[t as usize] = regions.members.len() as u32);
             regions.frames.push(Frame::new(origin, self.normals[label]));
             regions.members.push(part);
         }
