@@ -97,7 +97,7 @@ fn every_encoding_learns_a_kitchen() {
         config.field.encoding = encoding;
         config.field.frequency = FrequencyConfig { hidden: 32, head: 16, ..FrequencyConfig::default() };
         // So narrow networks take larger steps.
-        config.train.frequency_rate = 4.0 * config.train.frequency_rate;
+        config.train.frequency_rate *= 4.0;
         for stream in [&mut config.field.persistent, &mut config.field.dynamic, &mut config.field.actor] {
             stream.log2_rows = 13;
         }
@@ -127,7 +127,7 @@ fn resuming_gives_the_bytes_of_an_uninterrupted_training() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let scene = testing::scene(folder.path());
     // Interrupted half-way: once after the streams are settled, once before.
-    let cases = [0.2, 0.7].map(|static_until| config(static_until)).into_iter();
+    let cases = [0.2, 0.7].map(config).into_iter();
     for config in cases.chain(ENCODINGS[1..].iter().map(|e| config_of(*e, 0.2))) {
         let (straight, _) = train(&scene, &config, 2);
         let run = tempfile::tempdir().expect("a temporary folder");
