@@ -8,7 +8,7 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_main};
-use divff::field::hashgrid::{AXES, HashGrid, Level, Points, Row};
+use divff::field::hashgrid::{AXES, HashGrid, Lattice, Points, Row};
 use divff::field::mlp::{Activations, Mlp, Packed, Precision};
 use divff::render::composite::{self, Interval, Weighted};
 use divff::render::density_grid::{DensityGrid, STRIDE};
@@ -131,7 +131,7 @@ enum Table<'a> {
     Update(&'a mut TableState, &'a mut [Row]),
 }
 
-struct TablePass<'a>(&'a Level, &'a [Points], Table<'a>);
+struct TablePass<'a>(&'a Lattice, &'a [Points], Table<'a>);
 
 impl WithSimd for TablePass<'_> {
     type Output = ();

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::field::FieldConfig;
+use crate::field::{EncodingKind, FieldConfig};
 use crate::map::MapConfig;
 use crate::semantics::SemanticsConfig;
 use crate::stereo::StereoConfig;
@@ -153,6 +153,7 @@ impl Config {
         for (key, size) in [
             ("train.table_rate", t.table_rate),
             ("train.network_rate", t.network_rate),
+            ("train.frequency_rate", t.frequency_rate),
             ("train.exposure_rate", t.exposure_rate),
             ("train.pose_rate", t.pose_rate),
             ("train.rig_rate", t.rig_rate),
@@ -191,13 +192,23 @@ impl Config {
         range("field.near", format!("{near} and actor_reach {reach}"), ordered, "0 < near < actor_reach")?;
         let b = l.beta_min;
         range("loss.beta_min", b.to_string(), b.is_finite() && b > 0.0, "must be positive")?;
+        let f = &self.field.frequency;
+        let ok = (2..=16).contains(&f.bands)
+            && f.bands.is_multiple_of(2)
+            && (4..=512).contains(&f.hidden)
+            && (1..=8).contains(&f.layers)
+            && (4..=512).contains(&f.head);
+        let remedy = "bands 2-16 and even, hidden and head 4-512, layers 1-8";
+        range("field.frequency", format!("{f:?}"), ok, remedy)?;
+        // A row for each corner of one cell of space and time.
+        let fewest_rows = if self.field.encoding == EncodingKind::Dense { 4 } else { 1 };
         for (key, c) in [
             ("field.persistent", &self.field.persistent),
             ("field.dynamic", &self.field.dynamic),
             ("field.actor", &self.field.actor),
         ] {
             let ok = (1..=16).contains(&c.levels)
-                && (1..=24).contains(&c.log2_rows)
+                && (fewest_rows..=24).contains(&c.log2_rows)
                 && c.coarsest >= 1.0
                 && c.finest >= c.coarsest
                 && c.finest <= 65536.0
@@ -208,7 +219,7 @@ impl Config {
                 && (c.time_levels == 0 || c.time_levels <= 8 && (1.0..=65536.0).contains(&c.time_finest))
                 && (0.0..=1.0).contains(&c.time_cells)
                 && c.density_bias.abs() <= 15.0;
-            let remedy = "levels 1-16, log2_rows 1-24, 1 <= coarsest <= finest <= 65536, hidden 4-512, layers 1-8, \
+            let remedy = "levels 1-16, log2_rows 1-24 (4-24 without hashing), 1 <= coarsest <= finest <= 65536, hidden 4-512, layers 1-8, \
                           code <= 64, knots <= 65536, time_levels <= 8, 1 <= time_finest <= 65536, \
                           0 <= time_cells <= 1, \
                           density_bias within 15";

@@ -76,6 +76,9 @@ pub struct DemoArgs {
     /// Time for training; the rest takes about a minute
     #[arg(long, value_name = "TIME", default_value = "90s", value_parser = parse_duration)]
     pub time_budget: Duration,
+    /// How positions are encoded
+    #[arg(long, value_enum, default_value = "hash")]
+    pub encoding: EncodingArg,
 }
 
 /// `divff synth`.
@@ -96,6 +99,17 @@ pub struct SynthArgs {
     /// Seed of the kitchen and of what happens in it
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
+}
+
+/// How positions are encoded.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum EncodingArg {
+    /// Lattices of learned features, the fine ones hashed, and small networks
+    Hash,
+    /// The same without hashing: only as fine as the tables allow
+    Dense,
+    /// The paper's sines and cosines and deep networks: slow
+    Frequency,
 }
 
 /// How good a run should get.
@@ -142,6 +156,9 @@ pub struct SettingsArgs {
     /// Time for training, such as 90s, 5m or 1h30m; the schedule then follows the clock
     #[arg(long, value_name = "TIME", value_parser = parse_duration)]
     pub time_budget: Option<Duration>,
+    /// How positions are encoded [default: as in the file or --set, else hash]
+    #[arg(long, value_enum)]
+    pub encoding: Option<EncodingArg>,
     /// Compress features to as few numbers as lose at most this (1 - mean cosine, such as 0.02), instead of to 32
     #[arg(long, value_name = "E")]
     pub feature_error: Option<f64>,

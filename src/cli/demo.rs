@@ -35,6 +35,7 @@ pub fn demo(args: &DemoArgs, stop: StopFlag) -> Result<(), CliError> {
     let scene = own_scene(&scene_path, &options, &reporter)?;
     let mut config = Config::preset(Preset::Draft);
     config.seed = args.seed;
+    config.field.encoding = args.encoding.into();
     // The short budget is too short to find out that something moves; here it is known.
     config.train.streams = StreamChoice::All;
     // Its surrogate features are simple: a fifth of the work tells the things apart.

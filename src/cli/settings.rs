@@ -3,8 +3,9 @@
 use std::fs;
 
 use divff::config::{Config, Preset};
+use divff::field::EncodingKind;
 
-use super::args::{PresetArg, SettingsArgs};
+use super::args::{EncodingArg, PresetArg, SettingsArgs};
 use super::error::CliError;
 
 impl From<PresetArg> for Preset {
@@ -13,6 +14,16 @@ impl From<PresetArg> for Preset {
             PresetArg::Draft => Self::Draft,
             PresetArg::Standard => Self::Standard,
             PresetArg::Fine => Self::Fine,
+        }
+    }
+}
+
+impl From<EncodingArg> for EncodingKind {
+    fn from(encoding: EncodingArg) -> Self {
+        match encoding {
+            EncodingArg::Hash => Self::Hash,
+            EncodingArg::Dense => Self::Dense,
+            EncodingArg::Frequency => Self::Frequency,
         }
     }
 }
@@ -36,6 +47,9 @@ pub fn resolve(args: &SettingsArgs) -> Result<Config, CliError> {
     }
     if let Some(budget) = args.time_budget {
         config.time_budget_s = Some(budget.as_secs_f64());
+    }
+    if let Some(encoding) = args.encoding {
+        config.field.encoding = encoding.into();
     }
     if let Some(error) = args.feature_error {
         config.semantics.compress.feature_error = error;
@@ -71,6 +85,8 @@ mod tests {
         }
         let unknown = Config::default().with_setting("train.stepz=1").unwrap_err().to_string();
         assert!(unknown.contains("unknown field `stepz`"), "{unknown}");
+        let unknown = Config::default().with_setting("field.encoding=fourier").unwrap_err().to_string();
+        assert!(unknown.contains("`hash`, `dense`, `frequency`"), "{unknown}");
     }
 
     #[test]
@@ -81,9 +97,10 @@ mod tests {
         let args = SettingsArgs {
             preset: PresetArg::Draft,
             config: Some(path),
-            set: vec!["train.rays=128".into()],
+            set: vec!["train.rays=128".into(), "field.encoding=frequency".into()],
             seed: None,
             time_budget: None,
+            encoding: Some(EncodingArg::Dense),
             feature_error: Some(0.05),
             simplify: Some("5mm".parse().unwrap()),
         };
@@ -91,6 +108,7 @@ mod tests {
         assert_eq!((config.seed, config.train.steps, config.train.rays), (3, 10, 128));
         let compress = &config.semantics.compress;
         assert_eq!((compress.dim, compress.feature_error), (None, 0.05));
+        assert_eq!(config.field.encoding, EncodingKind::Dense);
         assert_eq!(config.map.simplify, Simplify::Within(0.005));
         assert!(resolve(&SettingsArgs { feature_error: Some(2.0), ..args }).is_err());
     }

@@ -2,6 +2,54 @@
 
 use serde::{Deserialize, Serialize};
 
+/// How positions are made into what networks see.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum EncodingKind {
+    /// Lattices of learned features, coarse to fine; what does not fit its table is hashed (instant-ngp).
+    #[default]
+    Hash,
+    /// The same without hashing: lattices only as fine as fit their tables.
+    Dense,
+    /// Sines and cosines of the position, under networks that are as deep as the paper's (NeRF).
+    Frequency,
+}
+
+/// Encoding and networks of [`EncodingKind::Frequency`]; by default those of the paper, for all three streams.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FrequencyConfig {
+    /// Number of bands, even: sine and cosine of 2^k π times each coordinate, for k from 0.
+    pub bands: usize,
+    /// Width of the trunk's layers, and of the features that it hands on to the head.
+    pub hidden: usize,
+    /// Hidden layers of the trunk. What comes after layer `layers / 2 + 1` (the fifth of eight) sees the trunk's input again.
+    pub layers: usize,
+    /// Width of the head's one hidden layer.
+    pub head: usize,
+}
+
+impl Default for FrequencyConfig {
+    fn default() -> Self {
+        Self { bands: 10, hidden: 256, layers: 8, head: 128 }
+    }
+}
+
+/// Widths of a stream's networks.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Widths {
+    /// Of the hidden layers of the trunk.
+    pub hidden: usize,
+    /// Number of hidden layers of the trunk.
+    pub layers: usize,
+    /// Layer of the trunk, from 0, that sees its input again.
+    pub skip: Option<usize>,
+    /// Output of the trunk: raw density, then geometry features for the head.
+    pub geometry: usize,
+    /// Hidden layer of the head.
+    pub head: usize,
+}
+
 /// Size of one stream's grid and networks.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -36,6 +84,10 @@ pub struct StreamConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FieldConfig {
+    /// How positions are encoded, in all three streams.
+    pub encoding: EncodingKind,
+    /// What [`EncodingKind::Frequency`] has instead of the streams' lattices and networks.
+    pub frequency: FrequencyConfig,
     /// The environment.
     pub persistent: StreamConfig,
     /// Objects that move now and then, in world coordinates.
@@ -87,6 +139,14 @@ impl Default for FieldConfig {
             time_cells: 1.0,
             ..dynamic.clone()
         };
-        Self { persistent, dynamic, actor, actor_reach: 0.25, near: 0.015 }
+        Self {
+            encoding: EncodingKind::default(),
+            frequency: FrequencyConfig::default(),
+            persistent,
+            dynamic,
+            actor,
+            actor_reach: 0.25,
+            near: 0.015,
+        }
     }
 }

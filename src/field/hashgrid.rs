@@ -24,9 +24,9 @@ pub const TIME: usize = 3;
 /// Points of one tile, `[axis][lane]`.
 pub type Points = [[f32; TILE]; AXES];
 
-/// The lattice of one level.
+/// One level: a lattice whose points have rows of a table.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Level {
+pub struct Lattice {
     /// Cells per unit length.
     pub scale: Vec3,
     /// Cells over the whole of time; 0 for a lattice of space alone.
@@ -53,7 +53,7 @@ struct Corners {
 #[derive(Clone, Debug, PartialEq)]
 pub struct HashGrid {
     /// Coarse to fine.
-    pub levels: Vec<Level>,
+    pub levels: Vec<Lattice>,
 }
 
 impl HashGrid {
@@ -64,7 +64,7 @@ impl HashGrid {
         let levels = (0..levels)
             .map(|n| {
                 let scale = coarsest * (finest / coarsest).powf(growth(n));
-                Level::new(extent, scale, 0.0, 1usize << log2_rows)
+                Lattice::new(extent, scale, 0.0, 1usize << log2_rows)
             })
             .collect();
         Self { levels }
@@ -85,22 +85,46 @@ impl HashGrid {
         self.levels.extend((0..levels).map(|n| {
             let growth = if levels > 1 { n as f32 / (levels - 1) as f32 } else { 1.0 };
             let [space, time] = std::array::from_fn(|k| coarsest[k] * (finest[k] / coarsest[k]).powf(growth));
-            Level::new(extent, Vec3::splat(space), time, 1usize << log2_rows)
+            Lattice::new(extent, Vec3::splat(space), time, 1usize << log2_rows)
         }));
         self
     }
-
-    /// Width of the encoding.
-    pub fn width(&self) -> usize {
-        self.levels.len() * FEATURES
-    }
 }
 
-impl Level {
+/// The coarsest and the finest cells per unit of space and of time that are asked for, made so large that every lattice
+/// between them fits `2^log2_rows` rows (4 or more) without hashing.
+///
+/// The finest lattice shrinks alike along all axes; levels are then spread up to it, so that no two are the same.
+pub fn without_hashing(
+    extent: Vec3,
+    coarsest: [f32; 2],
+    finest: [f32; 2],
+    log2_rows: u32,
+) -> ([f32; 2], [f32; 2]) {
+    let fits = |share: f32| {
+        let [space, time] = finest.map(|scale| share * scale);
+        let points = points(extent, Vec3::splat(space), time);
+        points.iter().map(|&p| p as usize).product::<usize>() <= 1 << log2_rows
+    };
+    // Bisection to the last bits of the share, which leaves the side that fits.
+    let (mut share, mut beyond) = if fits(1.0) { (1.0, 1.0) } else { (0.0, 1.0) };
+    while beyond - share > f32::EPSILON {
+        let middle = 0.5 * (share + beyond);
+        *(if fits(middle) { &mut share } else { &mut beyond }) = middle;
+    }
+    let finest = finest.map(|scale| share * scale);
+    (std::array::from_fn(|k| coarsest[k].min(finest[k])), finest)
+}
+
+/// Lattice points along each axis.
+fn points(extent: Vec3, scale: Vec3, time_scale: f32) -> [u32; AXES] {
+    let cells = (extent * scale).ceil().max(Vec3::ONE).as_uvec3();
+    [cells.x + 1, cells.y + 1, cells.z + 1, time_scale.ceil() as u32 + 1]
+}
+
+impl Lattice {
     fn new(extent: Vec3, scale: Vec3, time_scale: f32, max_rows: usize) -> Self {
-        let cells = (extent * scale).ceil().max(Vec3::ONE).as_uvec3();
-        let time_cells = time_scale.ceil() as u32;
-        let points = [cells.x + 1, cells.y + 1, cells.z + 1, time_cells + 1];
+        let points = points(extent, scale, time_scale);
         let lattice = points.iter().map(|&p| p as usize).product::<usize>();
         let dense = lattice <= max_rows;
         let (stride, rows) = if dense {
@@ -109,7 +133,7 @@ impl Level {
             // Instant-ngp's primes and one more; 1 for x keeps neighbours in x on one cache line.
             ([1, 2_654_435_761, 805_459_861, 3_674_653_429], max_rows)
         };
-        let last_cell = [cells.x - 1, cells.y - 1, cells.z - 1, time_cells.saturating_sub(1)];
+        let last_cell = points.map(|p| p.saturating_sub(2));
         Self { scale, time_scale, last_cell, stride, rows, dense }
     }
 

@@ -3,7 +3,7 @@
 
 use glam::Vec3;
 
-use super::hashgrid::{AXES, HashGrid, Level, Points, Row};
+use super::hashgrid::{AXES, HashGrid, Lattice, Points, Row, without_hashing};
 use crate::rng::Rng;
 use crate::simd::TILE;
 
@@ -37,7 +37,7 @@ fn tile(points: impl IntoIterator<Item = Vec3>) -> Tile {
 
 /// Every level's features of a tile, `[level][lane]`.
 fn encode(grid: &HashGrid, tables: &[Vec<Row>], pos: &Tile) -> Vec<[Row; TILE]> {
-    let encode = |(level, table): (&Level, &Vec<Row>)| {
+    let encode = |(level, table): (&Lattice, &Vec<Row>)| {
         let mut out = [Row::ZERO; TILE];
         level.encode(table, pos, &mut out);
         out
@@ -176,4 +176,30 @@ fn points_outside_the_box_or_not_finite_are_harmless() {
     let clamped = encode(&grid, &tables, &tile([EXTENT, Vec3::ZERO]));
     let outside = encode(&grid, &tables, &tile([EXTENT * 3.0, -EXTENT]));
     assert_eq!(clamped, outside, "a point outside is seen at the nearest point of the box");
+}
+
+#[test]
+fn without_hashing_every_level_fits_its_table_and_is_as_fine_as_that_allows() {
+    let grid = |coarsest: [f32; 2], finest: [f32; 2], log2_rows: u32| {
+        let ([a, t], [b, u]) = without_hashing(EXTENT, coarsest, finest, log2_rows);
+        assert!(a <= b && t <= u && b <= finest[0] && u <= finest[1]);
+        match finest[1] > 0.0 {
+            false => HashGrid::new(EXTENT, 4, Vec3::splat(a), Vec3::splat(b), log2_rows),
+            true => HashGrid { levels: Vec::new() }.with_time(EXTENT, 4, [a, t], [b, u], log2_rows),
+        }
+    };
+    for (coarsest, finest) in
+        [([4.0, 0.0], [512.0, 0.0]), ([4.0, 3.0], [64.0, 30.0]), ([40.0, 9.0], [41.0, 9.0])]
+    {
+        for log2_rows in [4, 5, 9, 17] {
+            let levels = grid(coarsest, finest, log2_rows).levels;
+            assert!(levels.iter().all(|l| l.dense && l.rows <= 1 << log2_rows), "2^{log2_rows}: {levels:?}");
+            // One cell more along each axis would be too many: (n + 2)^4 is less than 2.2 (n + 1)^4 from n = 5 on.
+            let finest = levels[levels.len() - 1].rows;
+            assert!(log2_rows < 17 || finest > (1 << 17) * 10 / 22, "{finest} rows");
+            assert!(levels.windows(2).all(|l| l[0].rows <= l[1].rows));
+        }
+    }
+    // What fits is left as it was asked for.
+    assert_eq!(without_hashing(EXTENT, [3.0, 0.0], [20.0, 0.0], 17), ([3.0, 0.0], [20.0, 0.0]));
 }

@@ -10,8 +10,21 @@ use crate::simd::{AlignedVec, TILE};
 /// Tiles of a chunk.
 const TILES: usize = 3;
 
-/// Networks of odd widths, one to four layers.
-const SHAPES: [&[usize]; 4] = [&[1, 1], &[5, 7, 3], &[13, 6, 9, 4], &[33, 18, 1, 17, 2]];
+/// A network: its widths, and the layer that sees the input again.
+type Shape = (&'static [usize], Option<usize>);
+
+/// Networks of odd widths, one to four layers; some see their input again, in the middle, at the end or after the first
+/// layer; and one as wide as the paper's.
+const SHAPES: [Shape; 8] = [
+    (&[1, 1], None),
+    (&[5, 7, 3], None),
+    (&[13, 6, 9, 4], None),
+    (&[33, 18, 1, 17, 2], None),
+    (&[9, 5, 11, 3], Some(1)),
+    (&[13, 6, 9, 10, 4], Some(2)),
+    (&[35, 7, 5], Some(1)),
+    (&[64, 256, 256, 256, 16], Some(2)),
+];
 
 /// Networks that are compared with f64.
 const SEEDS: usize = 100;
@@ -64,11 +77,16 @@ impl WithSimd for Pass<'_> {
 }
 
 impl Case {
-    fn new(widths: &[usize], seed: u64) -> Self {
-        let net = Mlp::new(widths);
+    fn new((widths, skip): Shape, seed: u64) -> Self {
+        let net = Mlp::with_skip(widths, skip);
         let mut rng = Rng::new(seed, 0, 0);
         let mut number = move || 2.0 * rng.uniform() - 1.0;
-        let params = (0..net.parameters()).map(|_| number()).collect();
+        // Wide layers have weights so small that what comes out is about as large as what goes in.
+        let mut params = Vec::new();
+        for [n_in, n_out] in net.shapes() {
+            let size = if n_in > 36 { (3.0 / n_in as f32).sqrt() } else { 1.0 };
+            params.extend((0..(n_in + 1) * n_out).map(|_| size * number()));
+        }
         let (rows, input, output) = (net.rows(), net.input(), net.output_row());
         let mut tiles = AlignedVec::zeros(TILES * rows * TILE);
         let mut grads = AlignedVec::zeros(TILES * rows * TILE);
@@ -81,28 +99,31 @@ impl Case {
 
     /// Activations and gradients of one sample in f64; adds its parameter gradients to `sums`.
     fn naive(&self, tile: usize, lane: usize, sums: &mut [f64]) -> (Vec<f64>, Vec<f64>) {
-        let widths = self.net.widths();
-        let rows = self.net.rows();
+        let shapes: Vec<[usize; 2]> = self.net.shapes().collect();
+        let (rows, first) = (self.net.rows(), self.net.input());
         let at = |data: &[f32], row: usize| f64::from(data[(tile * rows + row) * TILE + lane]);
-        let mut values: Vec<Vec<f64>> = vec![(0..widths[0]).map(|i| at(&self.tiles, i)).collect()];
+        let mut values: Vec<Vec<f64>> = vec![(0..first).map(|i| at(&self.tiles, i)).collect()];
         let mut starts = vec![0];
         let w = |n: usize| f64::from(self.params[n]);
-        for (n, pair) in widths.windows(2).enumerate() {
-            let [n_in, n_out] = [pair[0], pair[1]];
+        for (n, &[n_in, n_out]) in shapes.iter().enumerate() {
             let start = starts[n];
+            if values[n].len() < n_in {
+                let input = values[0].clone();
+                values[n].extend(input);
+            }
             let x = &values[n];
             let y = (0..n_out).map(|o| {
                 let sum: f64 = (0..n_in).map(|i| w(start + o * n_in + i) * x[i]).sum();
                 let y = sum + w(start + n_in * n_out + o);
-                if n + 2 < widths.len() { y.max(0.0) } else { y }
+                if n + 1 < shapes.len() { y.max(0.0) } else { y }
             });
             let y = y.collect();
             values.push(y);
             starts.push(start + n_in * n_out + n_out);
         }
         let mut grads = vec![(self.net.output_row()..rows).map(|o| at(&self.grads, o)).collect::<Vec<_>>()];
-        for n in (0..widths.len() - 1).rev() {
-            let [n_in, n_out] = [widths[n], widths[n + 1]];
+        let mut again = vec![0.0; first];
+        for (n, &[n_in, n_out]) in shapes.iter().enumerate().rev() {
             let (x, dy) = (&values[n], &grads[0]);
             for o in 0..n_out {
                 for i in 0..n_in {
@@ -112,24 +133,29 @@ impl Case {
             }
             let dx = (0..n_in).map(|i| {
                 let sum = (0..n_out).map(|o| w(starts[n] + o * n_in + i) * dy[o]).sum();
-                if n > 0 && x[i] <= 0.0 { 0.0 } else { sum }
+                let stopped = n > 0 && i < shapes[n - 1][1] && x[i] <= 0.0;
+                if stopped { 0.0 } else { sum }
             });
-            let dx = dx.collect();
+            let mut dx: Vec<f64> = dx.collect();
+            let fresh = if n > 0 { shapes[n - 1][1] } else { n_in };
+            again.iter_mut().zip(dx.drain(fresh..)).for_each(|(sum, g)| *sum += g);
             grads.insert(0, dx);
         }
+        grads[0].iter_mut().zip(&again).for_each(|(g, again)| *g += again);
         (values.concat(), grads.concat())
     }
 }
 
-/// Products of up to 36 numbers below 1 summed over up to four layers: a hundred roundings of sums below 100.
+/// Products of up to 36 numbers below 1 summed over up to four layers: a hundred roundings of sums below 100. Wider layers
+/// have smaller sums of more and smaller products.
 fn close(a: f32, b: f64, what: &str) {
     assert!((f64::from(a) - b).abs() < 2e-5 * (1.0 + b.abs()), "{what}: {a} is not {b}");
 }
 
 #[test]
 fn networks_match_f64_loops_forward_and_backward() {
-    for (n, widths) in SHAPES.into_iter().cycle().take(SEEDS).enumerate() {
-        let case = Case::new(widths, n as u64);
+    for (n, shape) in SHAPES.into_iter().cycle().take(SEEDS).enumerate() {
+        let case = Case::new(shape, n as u64);
         let out = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
         let mut sums = vec![0.0; case.net.parameters()];
         for tile in 0..TILES {
@@ -138,7 +164,7 @@ fn networks_match_f64_loops_forward_and_backward() {
                 let (output, input) = (case.net.output(), case.net.input());
                 for row in 0..output {
                     let k = (tile * output + row) * TILE + lane;
-                    close(out.values[k], values[case.net.output_row() + row], "output");
+                    close(out.values[k], values[values.len() - output + row], "output");
                 }
                 for row in 0..input {
                     close(out.gradients[(tile * input + row) * TILE + lane], grads[row], "gradient");
@@ -155,8 +181,8 @@ fn networks_match_f64_loops_forward_and_backward() {
 /// gradients are equal to the last bit; only sums over samples are taken in another order.
 #[test]
 fn all_fused_vector_widths_give_the_same_bits_per_sample() {
-    for (n, widths) in SHAPES.into_iter().enumerate() {
-        let case = Case::new(widths, n as u64);
+    for (n, shape) in SHAPES.into_iter().enumerate() {
+        let case = Case::new(shape, n as u64);
         let narrow = pulp::Scalar128b.vectorize(Pass(&case, Precision::F32, Unit::Portable));
         let wide = [
             pulp::Scalar256b.vectorize(Pass(&case, Precision::F32, Unit::Portable)),
@@ -175,8 +201,8 @@ fn all_fused_vector_widths_give_the_same_bits_per_sample() {
 /// The host's instructions and the plain fallback, which does not fuse: equal up to rounding.
 #[test]
 fn the_scalar_fallback_matches_the_hosts_instructions() {
-    for (n, widths) in SHAPES.into_iter().enumerate() {
-        let case = Case::new(widths, n as u64);
+    for (n, shape) in SHAPES.into_iter().enumerate() {
+        let case = Case::new(shape, n as u64);
         let host = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
         let plain = pulp::Scalar.vectorize(Pass(&case, Precision::F32, Unit::Portable));
         for (a, b) in host.values.iter().zip(&plain.values) {
@@ -195,8 +221,8 @@ fn bits(v: &[f32]) -> Vec<u32> {
 /// bf16 rounds every factor by up to 2⁻⁹, and flips some ReLUs: some per cent after four layers, in the mean.
 #[test]
 fn bf16_products_match_f32_ones() {
-    for (n, widths) in SHAPES.into_iter().enumerate() {
-        let case = Case::new(widths, n as u64);
+    for (n, shape) in SHAPES.into_iter().enumerate() {
+        let case = Case::new(shape, n as u64);
         let exact = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
         let rounded = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::detect()));
         for (a, b) in [
@@ -208,7 +234,7 @@ fn bf16_products_match_f32_ones() {
             let error: f32 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
             assert!(
                 error.sqrt() < 0.1 * size.sqrt(),
-                "{widths:?}: off by {} of {}",
+                "{shape:?}: off by {} of {}",
                 error.sqrt(),
                 size.sqrt()
             );
@@ -219,8 +245,8 @@ fn bf16_products_match_f32_ones() {
 /// The matrix units and plain loops sum in another order; what that changes is rounded away, or to the next bf16.
 #[test]
 fn the_matrix_units_match_plain_loops() {
-    for (n, widths) in SHAPES.into_iter().enumerate() {
-        let case = Case::new(widths, n as u64);
+    for (n, shape) in SHAPES.into_iter().enumerate() {
+        let case = Case::new(shape, n as u64);
         let units = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::detect()));
         let plain = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::Portable));
         for (a, b) in [
@@ -232,7 +258,7 @@ fn the_matrix_units_match_plain_loops() {
             let error: f32 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
             assert!(
                 error.sqrt() < 1e-3 * size.sqrt(),
-                "{widths:?}: off by {} of {}",
+                "{shape:?}: off by {} of {}",
                 error.sqrt(),
                 size.sqrt()
             );

@@ -5,6 +5,7 @@
 
 pub mod codes;
 pub mod config;
+pub mod encoding;
 pub mod hashgrid;
 #[cfg(test)]
 mod hashgrid_tests;
@@ -19,8 +20,10 @@ use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
 use self::codes::Trajectory;
-pub use self::config::{FieldConfig, StreamConfig};
-use self::hashgrid::{HashGrid, Row};
+use self::config::Widths;
+pub use self::config::{EncodingKind, FieldConfig, FrequencyConfig, StreamConfig};
+use self::encoding::Encoding;
+use self::hashgrid::{HashGrid, Row, without_hashing};
 use self::stream::{StreamNet, StreamRanges};
 use crate::scene::Aabb;
 
@@ -109,16 +112,24 @@ pub struct FieldShape {
 }
 
 impl FieldShape {
-    /// The lattices of a stream: over the box, or over the camera's frustum for the actor.
-    pub fn grid(&self, stream: Stream) -> HashGrid {
+    /// What a stream sees of a position: in the box, or in the camera's frustum for the actor.
+    pub fn encoding(&self, stream: Stream) -> Encoding {
         let c = self.config.stream(stream);
+        if self.config.encoding == EncodingKind::Frequency {
+            return Encoding::frequency(self.config.frequency.bands);
+        }
         let actor = stream == Stream::Actor;
         let extent = if actor { Vec3::ONE } else { self.normalisation.extent };
+        let range = |coarsest, finest| match self.config.encoding {
+            EncodingKind::Dense => without_hashing(extent, coarsest, finest, c.log2_rows),
+            _ => (coarsest, finest),
+        };
+        let ([coarsest, _], [finest, _]) = range([c.coarsest, 0.0], [c.finest, 0.0]);
+        let grid = HashGrid::new(extent, c.levels, Vec3::splat(coarsest), Vec3::splat(finest), c.log2_rows);
         let frames = self.times.len() as f32;
         let cells = (c.time_cells * frames).max(1.0);
-        let (coarsest, finest) = ([c.coarsest, 0.125 * frames], [c.time_finest, cells]);
-        HashGrid::new(extent, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows)
-            .with_time(extent, c.time_levels, coarsest, finest, c.log2_rows)
+        let (coarsest, finest) = range([c.coarsest, 0.125 * frames], [c.time_finest, cells]);
+        grid.with_time(extent, c.time_levels, coarsest, finest, c.log2_rows).into()
     }
 }
 
@@ -139,7 +150,7 @@ pub struct Field {
     pub pose: Trajectory,
     /// Where the dense parameters are.
     pub layout: Layout,
-    /// Hash tables `[stream][level][row]`.
+    /// Tables `[stream][level][row]`; those of levels without anything to learn are empty.
     pub tables: [Vec<Vec<Row>>; 3],
     /// Networks, codes, exposure and poses, by `layout`.
     pub weights: Vec<f32>,
@@ -156,6 +167,9 @@ pub struct Field {
 /// What a glossy door mirrors changes fast with the direction; what the colours of its surface cannot say is put behind it.
 pub const VIEW: usize = 24;
 
+/// Width of the trunk's output above lattices: raw density, then geometry features for the head.
+const GEOMETRY: usize = 16;
+
 impl Field {
     /// An untrained field with all numbers zero; see [`Self::init`].
     pub fn zeros(shape: FieldShape) -> Self {
@@ -164,9 +178,9 @@ impl Field {
         let times = &shape.times;
         let net = |stream: Stream| {
             let c = config.stream(stream);
-            let grid = shape.grid(stream);
             let view = if stream == Stream::Persistent { VIEW } else { 0 };
-            StreamNet::new(grid, c.hidden, c.layers, c.code, view, c.density_bias)
+            let widths = config.widths(stream);
+            StreamNet::new(shape.encoding(stream), &widths, c.code, view, c.density_bias)
         };
         let code = |stream: Stream| {
             let c = config.stream(stream);
@@ -225,6 +239,23 @@ impl FieldConfig {
     pub fn stream(&self, stream: Stream) -> &StreamConfig {
         [&self.persistent, &self.dynamic, &self.actor][stream as usize]
     }
+
+    /// Widths of the networks of one stream.
+    pub fn widths(&self, stream: Stream) -> Widths {
+        let (c, f) = (self.stream(stream), &self.frequency);
+        match self.encoding {
+            EncodingKind::Hash | EncodingKind::Dense => {
+                Widths { hidden: c.hidden, layers: c.layers, skip: None, geometry: GEOMETRY, head: c.hidden }
+            }
+            EncodingKind::Frequency => Widths {
+                hidden: f.hidden,
+                layers: f.layers,
+                skip: Some(f.layers / 2 + 1),
+                geometry: f.hidden,
+                head: f.head,
+            },
+        }
+    }
 }
 
 impl Layout {
@@ -260,7 +291,7 @@ impl Layout {
 }
 
 fn empty_tables(net: &StreamNet) -> Vec<Vec<Row>> {
-    net.grid.levels.iter().map(|l| vec![Row::ZERO; l.rows]).collect()
+    net.encoding.levels.iter().map(|l| vec![Row::ZERO; l.rows()]).collect()
 }
 
 /// What degrees 3 and 4 of the view encoding are multiplied by: colours that change fast with the direction are learned slowly, and

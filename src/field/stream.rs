@@ -8,13 +8,12 @@ use std::ops::Range;
 use glam::Vec3;
 use pulp::Simd;
 
-use super::hashgrid::{AXES, FEATURES, HashGrid, Level, Points, Row, TIME};
+use super::config::Widths;
+use super::encoding::{Encoding, Level};
+use super::hashgrid::{AXES, FEATURES, Points, Row, TIME};
 use super::mlp::{Activations, Mlp, Packed};
 use crate::simd::matrix::Unit;
 use crate::simd::{self, TILE};
-
-/// Width of the trunk's output: raw density, then geometry features for the head.
-const GEOMETRY: usize = 16;
 
 /// Raw densities are clamped to this before the exponential, so that neither σ nor its gradient overflows.
 const RAW_SIGMA_LIMIT: f32 = 15.0;
@@ -29,7 +28,7 @@ pub(crate) const BETA_MAX: f32 = 0.1;
 #[derive(Clone, Debug, PartialEq)]
 pub struct StreamNet {
     /// Encoding of the position.
-    pub grid: HashGrid,
+    pub encoding: Encoding,
     /// (encoding, code) → (raw density, geometry features).
     pub trunk: Mlp,
     /// (geometry features, view) → (raw colour, raw uncertainty).
@@ -175,10 +174,10 @@ impl StreamBatch {
     }
 
     /// The encoding to be made of the samples, level by level: see [`LevelTask::run`].
-    pub fn tasks<'a>(&'a mut self, grid: &'a HashGrid, tables: &'a [Vec<Row>]) -> Vec<LevelTask<'a>> {
+    pub fn tasks<'a>(&'a mut self, encoding: &'a Encoding, tables: &'a [Vec<Row>]) -> Vec<LevelTask<'a>> {
         let Self { sample, pos, levels, slopes, .. } = self;
-        levels.resize_with(grid.levels.len(), LevelRows::default);
-        let parts = grid.levels.iter().zip(tables).zip(levels);
+        levels.resize_with(encoding.levels.len(), LevelRows::default);
+        let parts = encoding.levels.iter().zip(tables).zip(levels);
         parts
             .map(|((level, table), out)| LevelTask {
                 level,
@@ -235,19 +234,19 @@ pub struct StreamActivations {
 
 impl StreamNet {
     /// Assembles the network around an encoding.
-    pub fn new(grid: HashGrid, hidden: usize, layers: usize, code: usize, view: usize, bias: f32) -> Self {
-        let mut trunk = vec![grid.width() + code];
-        trunk.extend(std::iter::repeat_n(hidden, layers));
-        trunk.push(GEOMETRY);
-        let trunk = Mlp::new(&trunk);
-        let head = Mlp::new(&[GEOMETRY + view, hidden, 4]);
-        Self { grid, trunk, head, code, view, density_bias: bias }
+    pub fn new(encoding: Encoding, widths: &Widths, code: usize, view: usize, bias: f32) -> Self {
+        let mut trunk = vec![encoding.width() + code];
+        trunk.extend(std::iter::repeat_n(widths.hidden, widths.layers));
+        trunk.push(widths.geometry);
+        let trunk = Mlp::with_skip(&trunk, widths.skip);
+        let head = Mlp::new(&[trunk.output() + view, widths.head, 4]);
+        Self { encoding, trunk, head, code, view, density_bias: bias }
     }
 
     /// Encodes all samples of `batch`.
     #[inline(always)]
     pub fn encode(&self, w: &StreamWeights, batch: &mut StreamBatch) {
-        for task in batch.tasks(&self.grid, w.tables) {
+        for task in batch.tasks(&self.encoding, w.tables) {
             task.run();
         }
     }
@@ -272,9 +271,9 @@ impl StreamNet {
         for (n, lanes) in batch.sample.chunks(TILE).enumerate() {
             self.trunk_forward(simd, &unit, w, batch, n, trunk, n, &code);
             let geometry = trunk.output(n);
-            let input = head.input(n);
-            input[..GEOMETRY * TILE].copy_from_slice(geometry);
-            condition(&mut input[GEOMETRY * TILE..], self.view, batch.rays(n), &view);
+            let (features, rest) = head.input(n).split_at_mut(geometry.len());
+            features.copy_from_slice(geometry);
+            condition(rest, self.view, batch.rays(n), &view);
             self.head.forward(simd, &unit, w.head, head, n);
             let mut raw = [[0.0; TILE]; 5];
             raw[0].copy_from_slice(&geometry[..TILE]);
@@ -334,7 +333,7 @@ impl StreamNet {
         n: usize,
         code: &impl Fn(usize) -> &'c [f32],
     ) {
-        let (features, rest) = trunk.input(n).split_at_mut(self.grid.width() * TILE);
+        let (features, rest) = trunk.input(n).split_at_mut(self.encoding.width() * TILE);
         for (level, out) in batch.levels.iter().zip(features.chunks_exact_mut(FEATURES * TILE)) {
             level.read_tile(tile, out);
         }
@@ -381,12 +380,12 @@ impl StreamNet {
             }
             self.head.backward(simd, &unit, w.head, head, n);
             let out = trunk.output_grad(n);
-            out.copy_from_slice(&head.input_grad(n)[..GEOMETRY * TILE]);
+            out.copy_from_slice(&head.input_grad(n)[..self.trunk.output() * TILE]);
             for (d, raw) in out.iter_mut().zip(&raw[0]) {
                 *d += raw;
             }
             self.trunk.backward(simd, &unit, w.trunk, trunk, n);
-            let (features, rest) = trunk.input_grad(n).split_at(self.grid.width() * TILE);
+            let (features, rest) = trunk.input_grad(n).split_at(self.encoding.width() * TILE);
             for (level, g) in levels.iter_mut().zip(features.chunks_exact(FEATURES * TILE)) {
                 level.write_tile(n, g);
             }

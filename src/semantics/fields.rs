@@ -261,7 +261,7 @@ impl SpaceHeader {
             return false;
         }
         let present = Stream::ALL.into_iter().filter(|s| shape.streams[*s as usize]);
-        let rows: usize = present.flat_map(|s| shape.grid(s).levels).map(|level| level.rows).sum();
+        let rows: usize = present.flat_map(|s| shape.grid(s).levels).map(|level| level.rows()).sum();
         rows <= MAX_ROWS && rows * size_of::<Row>() <= bytes
     }
 }

@@ -80,6 +80,28 @@ pub fn exp(x: f32) -> f32 {
     p * f32::from_bits(exponent)
 }
 
+/// sin(πx) and cos(πx) to 1.5e-7; branch-free, so that loops over it vectorise.
+///
+/// x is reduced to an eighth of a turn around the nearest quarter, exactly; beyond ±2^21, where floats are whole quarters
+/// themselves, it is taken as that.
+#[inline(always)]
+pub fn sin_cos_pi(x: f32) -> (f32, f32) {
+    // As in `exp`: rounds to the nearest integer and leaves it in the low mantissa bits.
+    const ROUND: f32 = 12_582_912.0;
+    const LIMIT: f32 = 2_097_152.0;
+    let x = x.clamp(-LIMIT, LIMIT);
+    let shifted = 2.0 * x + ROUND;
+    let quarter = shifted.to_bits();
+    let a = (x - 0.5 * (shifted - ROUND)) * std::f32::consts::PI;
+    let aa = a * a;
+    let sin = a + a * aa * (-1.0 / 6.0 + aa * (1.0 / 120.0 + aa * (-1.0 / 5040.0 + aa * (1.0 / 362_880.0))));
+    let cos = 1.0 + aa * (-0.5 + aa * (1.0 / 24.0 + aa * (-1.0 / 720.0 + aa * (1.0 / 40_320.0))));
+    let (s, c) = if quarter & 1 == 0 { (sin, cos) } else { (cos, sin) };
+    // By quarter turns the sine's sign is + + - - and the cosine's + - - +.
+    let flip = |v: f32, bit: u32| f32::from_bits(v.to_bits() ^ (bit & 2) << 30);
+    (flip(s, quarter), flip(c, quarter.wrapping_add(1)))
+}
+
 /// The whole number below x, at most `last` (< 2^23) and at least 0, as integer and float; 0 for NaN.
 ///
 /// `as u32` saturates lane by lane; adding 2^23 leaves the number in the low mantissa bits and vectorises.
@@ -161,6 +183,27 @@ mod tests {
             let err = (f64::from(exp(x)) - truth).abs() / truth;
             assert!(err < 2.5e-7, "exp({x}) is off by {err:e}");
         }
+    }
+
+    #[test]
+    fn sines_and_cosines_are_within_their_error() {
+        for i in 0..400_000 {
+            // Evenly over some turns, and over far ones.
+            let x = if i % 2 == 0 { -4.0 + i as f32 * 2e-5 } else { (i - 200_000) as f32 * 0.37 };
+            let (sin, cos) = sin_cos_pi(x);
+            let turn = std::f64::consts::PI * (f64::from(x) % 2.0);
+            let error = (f64::from(sin) - turn.sin()).abs().max((f64::from(cos) - turn.cos()).abs());
+            assert!(error < 1.5e-7, "{x} half turns are off by {error:e}");
+        }
+        assert_eq!(
+            [0.0, 0.5, 1.0, 1.5, 2.0, -0.5].map(|x| sin_cos_pi(x).0),
+            [0.0, 1.0, 0.0, -1.0, 0.0, -1.0]
+        );
+        for far in [1e9, f32::MAX, f32::INFINITY, f32::NEG_INFINITY] {
+            let (sin, cos) = sin_cos_pi(far);
+            assert!(sin.abs() <= 1.0 && cos.abs() <= 1.0, "{far}: {sin}, {cos}");
+        }
+        assert!(sin_cos_pi(f32::NAN).0.is_nan());
     }
 
     #[test]

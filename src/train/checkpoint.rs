@@ -104,8 +104,8 @@ impl Header {
         let rows: usize = Stream::ALL
             .into_iter()
             .filter(|s| shape.streams[*s as usize])
-            .flat_map(|s| shape.grid(s).levels)
-            .map(|level| level.rows)
+            .flat_map(|s| shape.encoding(s).levels)
+            .map(|level| level.rows())
             .sum();
         match rows.saturating_mul(size_of::<Row>()) <= bytes {
             true => Ok(()),

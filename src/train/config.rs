@@ -44,6 +44,8 @@ pub struct TrainConfig {
     pub table_rate: f32,
     /// Learning rate of networks and codes.
     pub network_rate: f32,
+    /// The same with `field.encoding = "frequency"`, whose networks are deeper; the paper's.
+    pub frequency_rate: f32,
     /// Learning rate of per-frame exposure.
     pub exposure_rate: f32,
     /// Learning rate of per-frame poses (rad and units); 0 trusts the poses.
@@ -88,6 +90,7 @@ impl Default for TrainConfig {
             time_spread: 1.0,
             table_rate: 3e-2,
             network_rate: 2e-3,
+            frequency_rate: 5e-4,
             exposure_rate: 1e-3,
             pose_rate: 1e-4,
             rig_rate: 1e-4,

@@ -23,7 +23,7 @@ pub enum TrainError {
     NoPixels,
     /// The numbers have left the range of f32: the learning rate is too high, or the input is not an image.
     #[error(
-        "{stage} is not finite at step {step} (index {index}); lower train.table_rate and train.network_rate"
+        "{stage} is not finite at step {step} (index {index}); lower train.table_rate and train.network_rate (or train.frequency_rate)"
     )]
     NonFinite {
         /// What was being computed.

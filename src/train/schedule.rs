@@ -2,6 +2,7 @@
 
 use super::config::TrainConfig;
 use super::step::StepPlan;
+use crate::field::EncodingKind;
 use crate::render::sampler::Sampling;
 
 /// Steps over which the learning rates rise to their full size.
@@ -14,12 +15,16 @@ const FINAL_RATE: f32 = 0.02;
 const EXPLORE_UNTIL: f32 = 0.125;
 
 impl TrainConfig {
-    /// The plan of step number `step` (from 1) at `progress` in [0, 1] of the schedule.
-    pub fn plan(&self, step: u64, progress: f64, streams: [bool; 3]) -> StepPlan {
+    /// The plan of step number `step` (from 1) at `progress` in [0, 1] of the schedule, for a field of that encoding.
+    pub fn plan(&self, encoding: EncodingKind, step: u64, progress: f64, streams: [bool; 3]) -> StepPlan {
         let p = progress as f32;
         let cosine = 0.5 * (1.0 + (std::f32::consts::PI * p).cos());
         let rate = (FINAL_RATE + (1.0 - FINAL_RATE) * cosine) * (step as f32 / WARM_UP).min(1.0);
         let refine = if progress >= self.refine_from { rate } else { 0.0 };
+        let network_rate = match encoding {
+            EncodingKind::Hash | EncodingKind::Dense => self.network_rate,
+            EncodingKind::Frequency => self.frequency_rate,
+        };
         let settled = (p / EXPLORE_UNTIL).min(1.0);
         StepPlan {
             step,
@@ -34,7 +39,7 @@ impl TrainConfig {
             },
             time_spread: self.time_spread,
             table_rate: self.table_rate * rate,
-            network_rate: self.network_rate * rate,
+            network_rate: network_rate * rate,
             exposure_rate: self.exposure_rate * rate,
             pose_rate: self.pose_rate * refine,
             rig_rate: self.rig_rate * refine,

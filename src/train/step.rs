@@ -182,8 +182,8 @@ fn encode(groups: &mut [Group], model: &Model) {
     let mut levels: [Vec<Vec<LevelTask>>; 3] = Default::default();
     for (s, batch) in groups.iter_mut().flat_map(Group::batches) {
         let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
-        levels[s].resize_with(net.grid.levels.len(), Vec::new);
-        for (level, task) in levels[s].iter_mut().zip(batch.tasks(&net.grid, w.tables)) {
+        levels[s].resize_with(net.encoding.levels.len(), Vec::new);
+        for (level, task) in levels[s].iter_mut().zip(batch.tasks(&net.encoding, w.tables)) {
             level.push(task);
         }
     }

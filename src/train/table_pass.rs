@@ -3,7 +3,8 @@
 use pulp::{Simd, WithSimd};
 
 use super::adam::{StepSize, TableState};
-use crate::field::hashgrid::{Level, Row};
+use crate::field::encoding::Level;
+use crate::field::hashgrid::Row;
 use crate::field::stream::StreamBatch;
 use crate::simd::TILE;
 
@@ -13,7 +14,7 @@ pub struct TablePass<'a, B> {
     pub batches: B,
     /// Number of the level.
     pub number: usize,
-    /// Its lattice.
+    /// What it is.
     pub level: &'a Level,
     /// Its rows.
     pub table: &'a mut [Row],

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 
 use crate::config::Config;
-use crate::field::{FieldShape, Normalisation, StreamConfig};
+use crate::field::{EncodingKind, FieldShape, FrequencyConfig, Normalisation, StreamConfig};
 use crate::rng::Rng;
 use crate::scene::{Aabb, Camera, Frame, Pose, Scene, Split};
 
@@ -121,6 +121,15 @@ pub fn config() -> Config {
     config.train.patch = 2;
     config.train.samples = 10;
     config.train.grid_cells = 16.0;
+    config
+}
+
+/// [`config`] with another encoding. Frequencies are few, and their networks deep enough for a layer on either side of the
+/// one that sees the input again.
+pub fn config_of(encoding: EncodingKind) -> Config {
+    let mut config = config();
+    config.field.encoding = encoding;
+    config.field.frequency = FrequencyConfig { bands: 6, hidden: 14, layers: 5, head: 10 };
     config
 }
 

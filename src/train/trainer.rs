@@ -287,7 +287,8 @@ impl Trainer {
     ) -> Result<StepReport, TrainError> {
         let Trained { field, grids, progress } = &mut self.trained;
         progress.step += 1;
-        let mut plan = self.config.train.plan(progress.step, fraction, self.streams);
+        let mut plan =
+            self.config.train.plan(self.config.field.encoding, progress.step, fraction, self.streams);
         if progress.trusts_poses {
             (plan.pose_rate, plan.rig_rate) = (0.0, 0.0);
         }

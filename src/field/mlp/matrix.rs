@@ -106,6 +106,11 @@ impl Packed {
                 Some(next) => {
                     let x = &mut x[next.x_row * *capacity..];
                     store(unit, rows, &packed.bias, Kept::Positive, pairs, x, place);
+                    if layers[n + 1].again > 0 {
+                        let (pairs, x) =
+                            (&mut pairs[layer.n_out / 2 * TILE..], &mut x[layer.n_out * *capacity..]);
+                        store(unit, input, &[], Kept::All, pairs, x, place);
+                    }
                 }
                 None => {
                     let rows = rows.as_chunks::<TILE>().0.iter().zip(output.as_chunks_mut::<TILE>().0);
@@ -135,12 +140,20 @@ impl Packed {
         let place = (*capacity, n * TILE);
         let (input, output) = grad.split_at_mut(layers[0].n_in * TILE);
         let last = &self.layers[layers.len() - 1];
+        let skips = layers.iter().any(|l| l.again > 0);
         store(unit, output, &[], Kept::All, pairs, &mut dy[last.dy_row * *capacity..], place);
         for (n, (layer, packed)) in layers.iter().zip(&self.layers).enumerate().rev() {
             let rows = multiply(unit, &packed.backward, layer.n_out, pairs, product, layer.n_in);
-            if n == 0 {
+            if n == 0 && skips {
+                input.iter_mut().zip(rows).for_each(|(g, row)| *g += row);
+                break;
+            } else if n == 0 {
                 input.copy_from_slice(rows);
                 break;
+            }
+            let (rows, again) = rows.split_at(layer.fresh() * TILE);
+            if layer.again > 0 {
+                input.copy_from_slice(again);
             }
             let kept = Kept::Where(&x[packed.x_row * *capacity..]);
             let dy = &mut dy[self.layers[n - 1].dy_row * *capacity..];

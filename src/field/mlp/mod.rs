@@ -56,12 +56,20 @@ pub struct Mlp {
 impl Mlp {
     /// A network of the given widths (input, hidden ..., output), each rounded up to a multiple of 4.
     pub fn new(widths: &[usize]) -> Self {
+        Self::with_skip(widths, None)
+    }
+
+    /// As [`Self::new`]; layer number `skip`, from 0, if there is one, sees what comes out of the layer before it and then the network's
+    /// input once more.
+    pub fn with_skip(widths: &[usize], skip: Option<usize>) -> Self {
         assert!(widths.len() >= 2, "a network has an input and an output");
+        assert!(skip != Some(0), "the first layer sees the input anyway");
         let widths: Vec<usize> = widths.iter().map(|w| w.next_multiple_of(BLOCK)).collect();
         let mut at = Layer::default();
-        let layers = widths.windows(2).map(|w| {
-            let layer = Layer { n_in: w[0], n_out: w[1], ..at };
-            at.row += w[0];
+        let layers = widths.windows(2).enumerate().map(|(n, w)| {
+            let again = if skip == Some(n) { widths[0] } else { 0 };
+            let layer = Layer { n_in: w[0] + again, n_out: w[1], again, ..at };
+            at.row += layer.n_in;
             at.param += layer.weights() + w[1];
             at.weight += layer.weights();
             at.bias += w[1];
@@ -85,9 +93,14 @@ impl Mlp {
         self.widths[self.widths.len() - 1]
     }
 
-    /// Rows of one tile: input and every layer's output.
+    /// Inputs and outputs of each layer, as rounded up.
+    pub fn shapes(&self) -> impl Iterator<Item = [usize; 2]> + '_ {
+        self.layers.iter().map(|l| [l.n_in, l.n_out])
+    }
+
+    /// Rows of one tile: every layer's input, and the output.
     pub fn rows(&self) -> usize {
-        self.widths.iter().sum()
+        self.shapes().map(|[n_in, _]| n_in).sum::<usize>() + self.output()
     }
 
     /// First row of the output within a tile.
@@ -195,6 +208,8 @@ impl Mlp {
 struct Layer {
     n_in: usize,
     n_out: usize,
+    /// Rows at the end of its input that are the network's input again.
+    again: usize,
     /// First activation row of its input.
     row: usize,
     /// Offset in the flat parameters.
@@ -209,6 +224,11 @@ impl Layer {
     fn weights(&self) -> usize {
         self.n_in * self.n_out
     }
+
+    /// Rows of its input that the layer before it (or the network's caller) has made.
+    fn fresh(&self) -> usize {
+        self.n_in - self.again
+    }
 }
 
 /// Weights in the orders that the kernels stream through.
@@ -222,7 +242,7 @@ pub enum Packed {
 /// Activations of a chunk of tiles, and their gradients.
 #[derive(Default)]
 pub struct Activations {
-    /// Per tile `input | layer 1 | ... | output`; in bf16 all tiles share `input | output`.
+    /// Per tile `input | layer 1 | ... | output`, with the input again where a layer sees it; in bf16 all tiles share `input | output`.
     values: AlignedVec,
     grads: AlignedVec,
     /// Floats from one tile to the next, and of one tile.

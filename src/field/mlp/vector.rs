@@ -1,6 +1,7 @@
 //! Networks in f32, on vectors of samples.
 //!
-//! A tile holds all its layers one after the other: `input | layer 1 | layer 2 | ...`, gradients likewise.
+//! A tile holds all its layers one after the other: `input | layer 1 | layer 2 | ...`, gradients likewise. Before a layer
+//! that sees the input again, there is a copy of it.
 
 use pulp::Simd;
 
@@ -38,6 +39,9 @@ impl Packed {
     #[inline(always)]
     pub(super) fn forward<S: Simd>(&self, simd: S, layers: &[Layer], tile: &mut [f32]) {
         for (n, layer) in layers.iter().enumerate() {
+            if layer.again > 0 {
+                tile.copy_within(..layer.again * TILE, (layer.row + layer.fresh()) * TILE);
+            }
             let (x, y) = tile[layer.row * TILE..].split_at_mut(layer.n_in * TILE);
             let w = &self.forward[layer.weight..][..layer.weights()];
             let bias = &self.bias[layer.bias..][..layer.n_out];
@@ -53,10 +57,17 @@ impl Packed {
             let w = &self.backward[layer.weight..][..layer.weights()];
             matmul(simd, w, &[], &dy[..layer.n_out * TILE], dx, false);
             if n > 0 {
-                let x = &tile[layer.row * TILE..][..layer.n_in * TILE];
+                let x = &tile[layer.row * TILE..][..layer.fresh() * TILE];
                 for (d, x) in dx.iter_mut().zip(x) {
                     *d = if *x > 0.0 { *d } else { 0.0 };
                 }
+            }
+        }
+        for layer in layers.iter().filter(|l| l.again > 0) {
+            let (input, rest) = grad.split_at_mut(layers[0].n_in * TILE);
+            let again = &rest[(layer.row + layer.fresh() - layers[0].n_in) * TILE..];
+            for (g, again) in input.iter_mut().zip(again) {
+                *g += again;
             }
         }
     }

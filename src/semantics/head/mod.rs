@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::render::{FeatureImage, render_features, trace_frame, trace_pixels};
 use super::config::{HeadStreamConfig, SemanticsConfig};
+use crate::field::encoding::Encoding;
 use crate::field::hashgrid::{FEATURES, HashGrid, Row};
 use crate::field::mlp::{Activations, Mlp, Packed, Precision};
 use crate::field::stream::StreamBatch;
@@ -64,7 +65,7 @@ pub struct HeadShape {
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeadNet {
     /// Encoding of the position.
-    pub grid: HashGrid,
+    pub grid: Encoding,
     /// Encoding → feature.
     pub mlp: Mlp,
 }
@@ -110,7 +111,7 @@ impl HeadShape {
     }
 
     /// The lattices of a stream: over the box, or over the camera's frustum for the actor.
-    pub fn grid(&self, stream: Stream) -> HashGrid {
+    pub fn grid(&self, stream: Stream) -> Encoding {
         let c = &self.encodings[stream as usize];
         let actor = stream == Stream::Actor;
         let extent = if actor { Vec3::ONE } else { self.extent };
@@ -119,6 +120,7 @@ impl HeadShape {
         let (coarsest, finest) = ([c.coarsest, 0.25 * frames], [c.time_finest, frames]);
         HashGrid::new(extent, c.levels, Vec3::splat(c.coarsest), Vec3::splat(c.finest), c.log2_rows)
             .with_time(extent, c.time_levels, coarsest, finest, c.log2_rows)
+            .into()
     }
 
     fn net(&self, stream: Stream) -> HeadNet {
@@ -134,7 +136,7 @@ impl Heads {
     /// Untrained fields with all numbers zero; see [`Self::init`].
     pub fn zeros(shape: HeadShape) -> Self {
         let nets = Stream::ALL.map(|s| shape.streams[s as usize].then(|| shape.net(s)));
-        let tables = |n: &HeadNet| n.grid.levels.iter().map(|l| vec![Row::ZERO; l.rows]).collect();
+        let tables = |n: &HeadNet| n.grid.levels.iter().map(|l| vec![Row::ZERO; l.rows()]).collect();
         Self {
             tables: nets.each_ref().map(|n| n.as_ref().map_or(Vec::new(), tables)),
             weights: nets

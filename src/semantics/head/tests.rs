@@ -175,7 +175,7 @@ fn gradients(heads: &Heads, sources: &Sources, targets: &RayTargets) -> Gradient
         let batch = group.batch(s);
         let levels = &heads.nets[s].as_ref().unwrap().grid.levels;
         let scattered = levels.iter().zip(&batch.levels).map(|(level, rows)| {
-            let mut grads = vec![Row::ZERO; level.rows];
+            let mut grads = vec![Row::ZERO; level.rows()];
             for (pos, g) in batch.tiles().iter().zip(rows.rows[..batch.len()].chunks(TILE)) {
                 level.scatter(&mut grads, pos, g);
             }

@@ -5,9 +5,10 @@ use std::ops::Range;
 use super::group::TrainChunk;
 use super::reference::{Numbers, Reference};
 use super::*;
-use crate::field::Stream;
+use crate::field::encoding::Level;
 use crate::field::hashgrid::{FEATURES, Row};
 use crate::field::mlp::Mlp;
+use crate::field::{EncodingKind, Stream};
 use crate::render::forward::Tracer;
 use crate::rng::Rng;
 use crate::simd::TILE;
@@ -46,7 +47,7 @@ pub(super) enum Place {
 
 /// Traces one chunk of a field whose numbers are all random, with holes in its density grids.
 pub(super) fn trace(seed: u64) -> Traced {
-    trace_with(seed, Precision::F32, weighed())
+    trace_with(EncodingKind::Hash, seed, Precision::F32, weighed())
 }
 
 /// Weights large enough that one per cent of a term is more than the tolerance.
@@ -73,11 +74,11 @@ fn seeds() -> impl Iterator<Item = u64> {
     (1..).filter(sees_all)
 }
 
-fn trace_with(seed: u64, precision: Precision, config: LossConfig) -> Traced {
+fn trace_with(encoding: EncodingKind, seed: u64, precision: Precision, config: LossConfig) -> Traced {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let mut pixels =
         PixelSet::load(testing::frames(folder.path()), 2.0, 0.5).expect("frames that were just written");
-    let settings = testing::config();
+    let settings = testing::config_of(encoding);
     let mut field = Field::zeros(testing::shape(&settings));
     field.init(seed);
     let mut rng = Rng::new(seed, 1, 0);
@@ -116,7 +117,7 @@ fn trace_with(seed: u64, precision: Precision, config: LossConfig) -> Traced {
     }
     grids.threshold = [0.05; 3];
     // Every fourth chunk refines poses: the first one does at a step that is a multiple of four.
-    let mut plan = settings.train.plan(4, 0.5, [true; 3]);
+    let mut plan = settings.train.plan(settings.field.encoding, 4, 0.5, [true; 3]);
     plan.precision = precision;
     // Patches that have rows of three, and as many of them as fit into a chunk.
     plan.patch = 3;
@@ -164,11 +165,11 @@ impl Traced {
         *loss = pulp::Arch::new().dispatch(ChunkPass { context: &context, chunk, dense });
         for s in 0..3 {
             let batch = &chunk.traced.batches[s];
-            let levels = field.nets[s].as_ref().expect("all streams are on").grid.levels.iter();
+            let levels = field.nets[s].as_ref().expect("all streams are on").encoding.levels.iter();
             tables[s] = levels
                 .zip(&batch.levels)
                 .map(|(level, out)| {
-                    let mut grad = vec![Row::ZERO; level.rows];
+                    let mut grad = vec![Row::ZERO; level.rows()];
                     for (pos, g) in batch.tiles().iter().zip(out.rows[..batch.len()].chunks(TILE)) {
                         level.scatter(&mut grad, pos, g);
                     }
@@ -203,9 +204,10 @@ impl Traced {
         let layout = &self.field.layout;
         for s in Stream::ALL {
             let net = self.field.net(s).expect("all streams are on");
-            for (n, level) in net.grid.levels.iter().enumerate() {
+            let learned = net.encoding.levels.iter().enumerate().filter(|(_, l)| l.rows() > 0);
+            for (n, level) in learned {
                 let name = format!("table {n} of {}", s.name());
-                groups.push((name, Place::Table(s as usize, n), 0..level.rows * FEATURES));
+                groups.push((name, Place::Table(s as usize, n), 0..level.rows() * FEATURES));
             }
             let r = &layout.streams[s as usize];
             for (part, net, start) in
@@ -247,10 +249,9 @@ impl Traced {
 
 /// Ranges of every layer's weights and biases.
 fn layers(net: &Mlp, mut start: usize) -> Vec<[Range<usize>; 2]> {
-    net.widths()
-        .windows(2)
-        .map(|w| {
-            let (a, b) = (start + w[0] * w[1], start + w[0] * w[1] + w[1]);
+    net.shapes()
+        .map(|[n_in, n_out]| {
+            let (a, b) = (start + n_in * n_out, start + n_in * n_out + n_out);
             let layer = [start..a, a..b];
             start = b;
             layer
@@ -335,6 +336,41 @@ fn every_gradient_matches_finite_differences() {
 }
 
 #[test]
+fn every_gradient_of_the_other_encodings_matches_finite_differences() {
+    let seed = seeds().next().expect("there is one");
+    for encoding in [EncodingKind::Dense, EncodingKind::Frequency] {
+        check(&trace_with(encoding, seed, Precision::F32, weighed()), seed);
+    }
+}
+
+/// Waves that are one per cent too short in the reference must make the gradients of some trunk disagree.
+#[test]
+#[should_panic(expected = "finite difference")]
+fn frequencies_that_are_off_by_one_per_cent_are_found() {
+    let seed = seeds().next().expect("there is one");
+    let mut traced = trace_with(EncodingKind::Frequency, seed, Precision::F32, weighed());
+    for net in traced.field.nets.iter_mut().flatten() {
+        for level in &mut net.encoding.levels {
+            if let Level::Waves { half_turns, .. } = level {
+                *half_turns *= 1.01;
+            }
+        }
+    }
+    // The loss itself would already tell.
+    traced.with_reference(|reference| {
+        let mut x = Numbers::of(&traced.field);
+        for (name, place, range) in traced.groups().into_iter().filter(|(name, ..)| name.contains("trunk")) {
+            let gradient = traced.gradient(place, range.clone());
+            let chosen = choose(gradient, &mut Rng::new(seed, 2, 0));
+            let numeric: Vec<f64> =
+                chosen.iter().map(|&n| difference(reference, &mut x, place, range.start + n, 1e-6)).collect();
+            let gradient: Vec<f64> = chosen.iter().map(|&n| f64::from(gradient[n])).collect();
+            assert_gradients_agree(&name, &gradient, &numeric);
+        }
+    });
+}
+
+#[test]
 fn directions_of_odd_cameras_project_back_to_their_pixels() {
     let traced = trace(4);
     for input in &traced.chunk.inputs {
@@ -411,7 +447,8 @@ fn bf16_gradients_agree_with_f32_ones() {
     for seed in seeds().take(3) {
         // Bends are differences of rounded numbers: at the weight that training gives them.
         let config = LossConfig { flatness: LossConfig::default().flatness, transient: 0.1, ..weighed() };
-        let [exact, rounded] = [Precision::F32, Precision::Bf16].map(|p| trace_with(seed, p, config.clone()));
+        let [exact, rounded] = [Precision::F32, Precision::Bf16]
+            .map(|p| trace_with(EncodingKind::Hash, seed, p, config.clone()));
         assert!((exact.loss - rounded.loss).abs() < 1e-2 * exact.loss.abs());
         for (name, place, range) in exact.groups() {
             let (a, b) = (exact.gradient(place, range.clone()), rounded.gradient(place, range.clone()));

@@ -7,7 +7,8 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::field::codes::Trajectory;
-use crate::field::hashgrid::{AXES, FEATURES, Level};
+use crate::field::encoding::Level;
+use crate::field::hashgrid::{AXES, FEATURES, Lattice};
 use crate::field::mlp::Mlp;
 use crate::field::stream::BETA_MAX;
 use crate::field::{FAST_CHANGE, Field, VIEW};
@@ -158,8 +159,8 @@ impl Reference<'_> {
         let extent = if s == 2 { DVec3::ONE } else { field.normalisation.extent.as_dvec3() };
         let time = f64::from(self.views[self.inputs[r].view as usize].time);
         let (p, extent) = ([p.x, p.y, p.z, time], [extent.x, extent.y, extent.z, 1.0]);
-        for (level, table) in net.grid.levels.iter().zip(&x.tables[s]) {
-            input.extend(interpolate(level, table, p, extent));
+        for (level, table) in net.encoding.levels.iter().zip(&x.tables[s]) {
+            input.extend(features(level, table, p, extent));
         }
         if let Some(code) = &field.codes[s] {
             input.extend(self.trajectory(code, &ranges.code, r, x));
@@ -222,8 +223,20 @@ impl Reference<'_> {
     }
 }
 
+/// The features of one level.
+fn features(level: &Level, table: &[f64], p: [f64; AXES], extent: [f64; AXES]) -> [f64; FEATURES] {
+    match *level {
+        Level::Lattice(ref lattice) => interpolate(lattice, table, p, extent),
+        Level::Position => [p[0], p[1], p[2], 0.0],
+        Level::Waves { axis, half_turns } => {
+            let angle = f64::from(half_turns) * std::f64::consts::PI * p[axis];
+            [angle.sin(), angle.cos(), (2.0 * angle).sin(), (2.0 * angle).cos()]
+        }
+    }
+}
+
 /// Trilinear interpolation of one level's rows.
-fn interpolate(level: &Level, table: &[f64], p: [f64; AXES], extent: [f64; AXES]) -> [f64; FEATURES] {
+fn interpolate(level: &Lattice, table: &[f64], p: [f64; AXES], extent: [f64; AXES]) -> [f64; FEATURES] {
     let scale = [level.scale.x, level.scale.y, level.scale.z, level.time_scale];
     let (mut cell, mut frac, mut points) = ([0u64; AXES], [0.0; AXES], [1u64; AXES]);
     for axis in (0..AXES).filter(|&a| scale[a] > 0.0) {
@@ -256,18 +269,24 @@ fn interpolate(level: &Level, table: &[f64], p: [f64; AXES], extent: [f64; AXES]
     out
 }
 
-/// A fully connected network with ReLU between its layers; a short input is padded with zeros.
-pub fn network(net: &Mlp, params: &[f64], mut x: Vec<f64>) -> Vec<f64> {
-    let widths = net.widths();
+/// A fully connected network with ReLU between its layers; a short input is padded with zeros, and follows what a layer
+/// gets where that takes more.
+pub fn network(net: &Mlp, params: &[f64], mut input: Vec<f64>) -> Vec<f64> {
+    input.resize(net.input(), 0.0);
+    let mut x = input.clone();
     let mut rest = params;
-    for (n, w) in widths.windows(2).enumerate() {
-        x.resize(w[0], 0.0);
-        let (weights, after) = rest.split_at(w[0] * w[1]);
-        let (bias, after) = after.split_at(w[1]);
+    let layers: Vec<[usize; 2]> = net.shapes().collect();
+    for (n, &[n_in, n_out]) in layers.iter().enumerate() {
+        if x.len() < n_in {
+            x.extend_from_slice(&input);
+        }
+        assert_eq!(x.len(), n_in);
+        let (weights, after) = rest.split_at(n_in * n_out);
+        let (bias, after) = after.split_at(n_out);
         rest = after;
-        let row = |o: usize| weights[o * w[0]..][..w[0]].iter().zip(&x).map(|(a, b)| a * b).sum::<f64>();
-        let y: Vec<f64> = (0..w[1]).map(|o| row(o) + bias[o]).collect();
-        let last = n + 2 == widths.len();
+        let row = |o: usize| weights[o * n_in..][..n_in].iter().zip(&x).map(|(a, b)| a * b).sum::<f64>();
+        let y: Vec<f64> = (0..n_out).map(|o| row(o) + bias[o]).collect();
+        let last = n + 1 == layers.len();
         x = if last { y } else { y.into_iter().map(|v| v.max(0.0)).collect() };
     }
     x

@@ -25,7 +25,7 @@ pub fn update(
         // Finest levels first: they take longest.
         for (s, (tables, states)) in field.tables.iter_mut().zip(tables).enumerate() {
             let (true, Some(net)) = (plan.streams[s], &field.nets[s]) else { continue };
-            let levels = net.grid.levels.iter().enumerate();
+            let levels = net.encoding.levels.iter().enumerate();
             for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)).rev() {
                 let chunks = groups.iter().flat_map(|g| &g.chunks);
                 let batches = chunks.map(move |chunk| &chunk.traced.batches[s]);

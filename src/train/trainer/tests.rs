@@ -3,13 +3,21 @@
 use std::ops::ControlFlow;
 
 use super::*;
+use crate::field::{EncodingKind, FrequencyConfig};
+use crate::synth::{SynthOptions, generate};
 use crate::train::testing;
 
 /// Steps of the tests' schedules: two reports.
 const STEPS: u64 = 2 * REPORT_EVERY;
 
+const ENCODINGS: [EncodingKind; 3] = [EncodingKind::Hash, EncodingKind::Dense, EncodingKind::Frequency];
+
 fn config(static_until: f64) -> Config {
-    let mut config = testing::config();
+    config_of(EncodingKind::Hash, static_until)
+}
+
+fn config_of(encoding: EncodingKind, static_until: f64) -> Config {
+    let mut config = testing::config_of(encoding);
     config.train.steps = STEPS;
     config.train.streams = StreamChoice::All;
     config.train.static_until = static_until;
@@ -47,10 +55,13 @@ fn train(scene: &Scene, config: &Config, threads: usize) -> (Vec<u8>, Vec<Progre
 fn the_same_seed_gives_the_same_bytes_on_any_number_of_threads() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let scene = testing::scene(folder.path());
+    for config in ENCODINGS.map(|e| config_of(e, 0.3)) {
+        let (one, _) = train(&scene, &config, 1);
+        let (two, _) = train(&scene, &config, 2);
+        assert!(one == two, "{:?}: two threads give other bytes than one", config.field.encoding);
+    }
     let config = config(0.3);
     let (one, _) = train(&scene, &config, 1);
-    let (two, _) = train(&scene, &config, 2);
-    assert!(one == two, "two threads give other bytes than one");
     let (other, _) = train(&scene, &Config { seed: config.seed + 1, ..config }, 2);
     assert!(one != other, "the seed must matter");
 }
@@ -73,13 +84,52 @@ fn the_wall_is_learned() {
     assert!(seen > 18.0, "a frame that was trained on has {seen} dB");
 }
 
+/// A kitchen in 24 small pictures: what each encoding says of them after some hundred steps must be far better than the
+/// best single colour.
+#[test]
+fn every_encoding_learns_a_kitchen() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let options = SynthOptions { frames: 24, width: 48, height: 27, seed: 1 };
+    generate(&options, folder.path()).expect("the temporary folder can be written");
+    let scene = Scene::open(folder.path()).expect("it was just made");
+    // Networks on frequencies have hardly begun after so few steps.
+    for (encoding, margin) in ENCODINGS.into_iter().zip([5.0, 5.0, 1.0]) {
+        let mut config = Config::default();
+        config.field.encoding = encoding;
+        config.field.frequency = FrequencyConfig { hidden: 32, head: 16, ..FrequencyConfig::default() };
+        // So narrow networks take larger steps.
+        config.train.frequency_rate *= 10.0;
+        for stream in [&mut config.field.persistent, &mut config.field.dynamic, &mut config.field.actor] {
+            stream.log2_rows = 13;
+        }
+        config.train.streams = StreamChoice::Static;
+        config.train.stereo_at = 1.0;
+        config.train.align_at = Vec::new();
+        (config.train.steps, config.train.rays, config.train.samples) = (300, 512, 8);
+        (config.train.render_samples, config.train.grid_cells) = (16, 32.0);
+        let (_, reports) = train(&scene, &config, 2);
+        let learned = reports[reports.len() - 1].psnr;
+        let plain = psnr_of_mean_colour(&Trainer::new(&scene, &config).expect("the scene is valid").pixels);
+        assert!(learned > plain + margin, "{encoding:?}: {learned} dB; the mean colour has {plain} dB");
+    }
+}
+
+/// PSNR, dB, of pictures that show nothing but their own mean colour.
+fn psnr_of_mean_colour(pixels: &PixelSet) -> f64 {
+    let mean = pixels.mean_colour();
+    let all = || pixels.images.iter().flatten();
+    let squared =
+        |rgb: &[u8; 3]| (0..3).map(|c| (f64::from(rgb[c]) / 255.0 - f64::from(mean[c])).powi(2)).sum::<f64>();
+    -10.0 * (all().map(squared).sum::<f64>() / (3 * all().count()) as f64).log10()
+}
+
 #[test]
 fn resuming_gives_the_bytes_of_an_uninterrupted_training() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let scene = testing::scene(folder.path());
     // Interrupted half-way: once after the streams are settled, once before.
-    for static_until in [0.2, 0.7] {
-        let config = config(static_until);
+    let cases = [0.2, 0.7].map(config).into_iter();
+    for config in cases.chain(ENCODINGS[1..].iter().map(|e| config_of(*e, 0.2))) {
         let (straight, _) = train(&scene, &config, 2);
         let run = tempfile::tempdir().expect("a temporary folder");
         let mut first = Trainer::new(&scene, &config).expect("the test's scene is valid");
@@ -89,7 +139,8 @@ fn resuming_gives_the_bytes_of_an_uninterrupted_training() {
         let mut second = Trainer::resume(&scene, &config, run.path()).expect("the checkpoint is whole");
         second.run(run.path(), None, &mut |_| ControlFlow::Continue(())).expect("training goes through");
         assert_eq!(second.trained().progress.step, STEPS);
-        assert!(bytes(&mut second) == straight, "static until {static_until}: resumed to other bytes");
+        let (encoding, until) = (config.field.encoding, config.train.static_until);
+        assert!(bytes(&mut second) == straight, "{encoding:?}, static until {until}: resumed to other bytes");
     }
 }
 
