@@ -25,3 +25,4 @@ pub mod simd;
 pub mod stereo;
 pub mod synth;
 pub mod train;
+pub mod work;

@@ -152,7 +152,7 @@ fn killed_training_goes_on_to_the_bytes_of_an_undisturbed_run() {
             assert_eq!(a.1, b.1, "the header of {name} after {killed} kills");
             assert!(a.0 == b.0, "{name} differs after {killed} kills");
         }
-        assert_eq!(finals(&out), finals(reference));
+        assert_eq!(files(&out), finals(reference), "what the kills left over is gone");
         finished += 1;
         std::fs::remove_dir_all(&out).unwrap();
     }
@@ -191,7 +191,7 @@ fn a_killed_export_leaves_old_and_new_files_and_the_next_one_is_complete() {
         }
     }
     finish(&export(&out, voxels[0]));
-    assert_eq!(finals(&out), finals(&references[0]));
+    assert_eq!(files(&out), finals(&references[0]), "what the kills left over is gone");
     assert_old_or_new(&out, &references[..1]);
 }
 

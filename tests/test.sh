@@ -24,6 +24,13 @@ cargo fmt --all --check
 step "lints"
 cargo clippy --workspace --all-targets --locked --release -- -D warnings
 
+step "licences and sources of dependencies, and what is known against them"
+if cargo deny --version 2> /dev/null; then
+    cargo deny --all-features check
+else
+    echo "cargo-deny is not installed (cargo install cargo-deny): not checked"
+fi
+
 step "documentation"
 RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps --locked --release
 

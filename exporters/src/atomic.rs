@@ -3,6 +3,7 @@
 mod disk;
 #[cfg(test)]
 pub(crate) mod faults;
+mod stale;
 
 use std::fs;
 use std::io::{self, BufWriter, Write};
@@ -61,13 +62,14 @@ fn write_and_replace(path: &Path, write: impl FnOnce(&mut AtomicWriter) -> io::R
     write(&mut writer)?;
     let file = writer.into_inner().map_err(io::IntoInnerError::into_error)?;
     file.sync()?;
-    drop(file);
     disk::rename(&cleanup.path, path)?;
     cleanup.armed = false;
+    // Its lock goes with it: from here on it has its name, and nobody takes it for a leftover.
+    drop(file);
     disk::sync_folder(folder_of(path), path)
 }
 
-/// Creates `.<name>.<process>-<counter>.tmp`.
+/// Creates `.<name>.<process>-<counter>.tmp`, and removes what killed writers of the same name left behind.
 ///
 /// The process id and the counter keep apart the writers of one machine; `create_new` those of several
 /// machines or containers that share the folder and happen to have the same process id.
@@ -76,6 +78,9 @@ fn create_temp_beside(path: &Path) -> io::Result<(TempFile, Cleanup)> {
     let Some(name) = path.file_name() else {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "the path does not name a file"));
     };
+    if let Some(name) = name.to_str() {
+        stale::remove(folder_of(path), name);
+    }
     loop {
         let counter = COUNTER.fetch_add(1, Ordering::Relaxed);
         let mut temp_name = std::ffi::OsString::from(".");

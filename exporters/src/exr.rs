@@ -50,6 +50,20 @@ pub struct ExrImage {
     pub channels: Vec<ExrChannel>,
 }
 
+/// How the pixels are stored. Others than [`Self::Zip`] are there to be compared with it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ExrCompression {
+    /// As they are.
+    None,
+    /// Deflated, in blocks of 16 lines.
+    #[default]
+    Zip,
+    /// Wavelets and Huffman's codes.
+    Piz,
+    /// Deflated; f32 loses the last 8 of its 24 digits, f16 nothing.
+    Pxr24,
+}
+
 /// More pixels than this along a side are taken for a damaged header.
 const MAX_SIDE: usize = 1 << 20;
 
@@ -114,11 +128,19 @@ fn is_channel_name(name: &str) -> bool {
     (1..=255).contains(&name.len()) && name.bytes().all(|b| b.is_ascii_graphic())
 }
 
-/// Writes a picture. Takes it by value: the samples are moved, not copied.
+/// Writes a picture, deflated. Takes it by value: the samples are moved, not copied.
 ///
 /// # Errors
 /// `Inconsistent` for wrong lengths, sizes or names; `NonFinite` with channel and pixel; `Io`.
 pub fn write_exr(path: &Path, image: ExrImage) -> Result<()> {
+    write_exr_with(path, image, ExrCompression::Zip)
+}
+
+/// As [`write_exr`], with another compression.
+///
+/// # Errors
+/// As for [`write_exr`].
+pub fn write_exr_with(path: &Path, image: ExrImage, compression: ExrCompression) -> Result<()> {
     image.validate(&path.display().to_string())?;
     let channels = image.channels.into_iter().map(|channel| {
         let samples = match channel.samples {
@@ -129,7 +151,12 @@ pub fn write_exr(path: &Path, image: ExrImage) -> Result<()> {
     });
     let channels = x::AnyChannels::sort(channels.collect());
     let encoding = x::Encoding {
-        compression: x::Compression::ZIP16,
+        compression: match compression {
+            ExrCompression::None => x::Compression::Uncompressed,
+            ExrCompression::Zip => x::Compression::ZIP16,
+            ExrCompression::Piz => x::Compression::PIZ,
+            ExrCompression::Pxr24 => x::Compression::PXR24,
+        },
         blocks: x::Blocks::ScanLines,
         line_order: x::LineOrder::Increasing,
     };
@@ -138,7 +165,11 @@ pub fn write_exr(path: &Path, image: ExrImage) -> Result<()> {
     let picture =
         x::Image::from_layer(x::Layer::new(size, x::LayerAttributes::default(), encoding, channels));
     write_atomically(path, |file| {
-        write_blocks(file, &picture).map_err(|error| match error {
+        let written = match compression {
+            ExrCompression::Zip => write_blocks(file, &picture),
+            _ => picture.write().to_buffered(file),
+        };
+        written.map_err(|error| match error {
             exr::error::Error::Io(source) => source,
             other => io::Error::other(other),
         })

@@ -30,7 +30,7 @@ mod validate;
 
 pub use axes::UpAxis;
 pub use error::{Error, Result};
-pub use exr::{ExrChannel, ExrImage, ExrSamples, read_exr, write_exr};
+pub use exr::{ExrChannel, ExrCompression, ExrImage, ExrSamples, read_exr, write_exr, write_exr_with};
 pub use geometry::{Attribute, AttributeValues, Features, Geometry};
 pub use glb::{GlbContents, GlbNode, GlbOptions, GlbScene, Interval, read_glb, write_glb, write_scene_glb};
 pub use manifest::Manifest;

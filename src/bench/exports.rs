@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use divff_exporters::{
-    AttributeValues, Error, ExrChannel, ExrImage, ExrSamples, Geometry, GlbOptions, NpzCompression,
-    PlyOptions, UpAxis, read_exr, read_glb, read_npz, read_ply, write_exr, write_glb, write_npz, write_ply,
+    AttributeValues, Error, ExrChannel, ExrCompression, ExrImage, ExrSamples, Geometry, GlbOptions,
+    NpzCompression, PlyOptions, UpAxis, read_exr, read_glb, read_npz, read_ply, write_exr_with, write_glb,
+    write_npz, write_ply,
 };
 use half::f16;
 
@@ -121,8 +122,14 @@ fn least(job: impl Fn() -> Result<(), Error>) -> Result<f64, Error> {
 
 fn clouds(points: &Geometry) -> Vec<Way<'_>> {
     let truth = || columns(points, true);
-    let npz = |compression| move |path: &Path| write_npz(path, points, compression);
-    let read = || Box::new(|path: &Path| Ok(columns(&read_npz(path)?, true)));
+    let npz = |name, file, compression| Way {
+        name,
+        file,
+        write: Box::new(move |path: &Path| write_npz(path, points, compression)),
+        read: Box::new(|path: &Path| Ok(columns(&read_npz(path)?, true))),
+        truth: truth(),
+        peer: None,
+    };
     let ply = |peer, name, file| Way {
         name,
         file,
@@ -134,22 +141,9 @@ fn clouds(points: &Geometry) -> Vec<Way<'_>> {
     vec![
         ply(peers::OPEN3D_PLY, "PLY beside Open3D", "points.ply"),
         ply(peers::PLYFILE_PLY, "PLY beside plyfile", "points2.ply"),
-        Way {
-            name: "NPZ stored",
-            file: "stored.npz",
-            write: Box::new(npz(NpzCompression::Stored)),
-            read: read(),
-            truth: truth(),
-            peer: None,
-        },
-        Way {
-            name: "NPZ deflated",
-            file: "deflated.npz",
-            write: Box::new(npz(NpzCompression::Deflated)),
-            read: read(),
-            truth: truth(),
-            peer: None,
-        },
+        npz("NPZ stored", "stored.npz", NpzCompression::Stored),
+        npz("NPZ deflated", "deflated.npz", NpzCompression::Deflated),
+        npz("NPZ with f16 features", "half.npz", NpzCompression::HalfFeatures),
     ]
 }
 
@@ -181,15 +175,23 @@ fn meshes(mesh: &Geometry, up_axis: UpAxis) -> Vec<Way<'_>> {
 }
 
 fn views(view: &Columns) -> Vec<Way<'_>> {
-    let way = |name, file, half| Way {
+    let way = |name, file, half, compression| Way {
         name,
         file,
-        write: Box::new(move |path: &Path| write_exr(path, exr(view, half))),
+        write: Box::new(move |path: &Path| write_exr_with(path, exr(view, half), compression)),
         read: Box::new(|path| Ok(read_exr(path)?.channels.into_iter().map(|c| samples(c.samples)).collect())),
         truth: view[..view.len() - 1].to_vec(),
         peer: None,
     };
-    vec![way("EXR of f16", "f16.exr", true), way("EXR of f32", "f32.exr", false)]
+    vec![
+        way("EXR of f16 as ZIP", "f16.zip.exr", true, ExrCompression::Zip),
+        way("EXR of f16 as it is", "f16.none.exr", true, ExrCompression::None),
+        way("EXR of f16 as PIZ", "f16.piz.exr", true, ExrCompression::Piz),
+        way("EXR of f32 as ZIP", "f32.zip.exr", false, ExrCompression::Zip),
+        way("EXR of f32 as it is", "f32.none.exr", false, ExrCompression::None),
+        way("EXR of f32 as PIZ", "f32.piz.exr", false, ExrCompression::Piz),
+        way("EXR of f32 as PXR24", "f32.pxr24.exr", false, ExrCompression::Pxr24),
+    ]
 }
 
 /// Channels `a`, `b`, … of columns; the last column holds the width alone.
@@ -293,7 +295,9 @@ mod tests {
                     .unwrap()
             })
             .collect();
-        assert!(errors[0] > 0.0 && errors[0] < 1e-3, "f16 rounds: {errors:?}");
-        assert_eq!(errors[1], 0.0);
+        let (halves, &[zip, none, piz, pxr24]) = errors.split_at(3) else { panic!("{errors:?}") };
+        assert!(halves.iter().all(|e| *e == halves[0] && *e > 0.0 && *e < 1e-3), "f16 rounds: {errors:?}");
+        assert_eq!([zip, none, piz], [0.0; 3]);
+        assert!(pxr24 < 1e-4, "24 bits are left: {errors:?}");
     }
 }

@@ -94,7 +94,8 @@ fn map_row(
     Ok(Some(row))
 }
 
-fn megabytes(path: &Path) -> Option<f64> {
+/// Size of a file.
+pub(super) fn megabytes(path: &Path) -> Option<f64> {
     Some(std::fs::metadata(path).ok()?.len() as f64 / 1e6)
 }
 

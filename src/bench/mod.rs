@@ -12,6 +12,7 @@ mod maps;
 mod page;
 pub mod peers;
 mod runs;
+mod simplify;
 mod table;
 
 use std::fmt;
@@ -42,6 +43,8 @@ pub enum Kind {
     Voxel,
     /// How the surface is found.
     Method,
+    /// How far simplification may go.
+    Simplify,
     /// Width and storage of compressed features.
     Features,
     /// File format and storage.
@@ -50,12 +53,19 @@ pub enum Kind {
 
 impl Kind {
     /// All, in the order in which they are run.
-    pub const ALL: [Self; 6] =
-        [Self::Training, Self::Encoding, Self::Voxel, Self::Method, Self::Features, Self::Export];
+    pub const ALL: [Self; 7] = [
+        Self::Training,
+        Self::Encoding,
+        Self::Voxel,
+        Self::Method,
+        Self::Simplify,
+        Self::Features,
+        Self::Export,
+    ];
 
     /// Name on the command line and of the files.
     pub fn name(self) -> &'static str {
-        ["training", "encoding", "voxel", "method", "features", "export"][self as usize]
+        ["training", "encoding", "voxel", "method", "simplify", "features", "export"][self as usize]
     }
 }
 
@@ -140,6 +150,7 @@ impl Bench<'_> {
             Kind::Encoding => runs::encoding(self),
             Kind::Voxel => maps::voxel(self),
             Kind::Method => maps::method(self),
+            Kind::Simplify => simplify::simplify(self),
             Kind::Features => features::features(self),
             Kind::Export => return exports::export(self),
         };

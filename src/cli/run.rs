@@ -153,7 +153,7 @@ pub fn eval(args: &EvalArgs, stop: StopFlag) -> Result<(), CliError> {
     let (trained, config) = (run.trained()?, run.config()?);
     // What the other stages took is known from when they ran.
     let earlier = pipeline::metrics::read(&run.metrics_path());
-    let cost = earlier.as_ref().map_or_else(Cost::default, |m| m.cost.clone());
+    let cost = earlier.as_ref().map_or_else(Cost::default, RunMetrics::known_cost);
     reporter.event(&Event::Stage(Stage::Evaluating));
     let fields = pipeline::features(&run, &trained)?;
     let fields = fields.as_ref();

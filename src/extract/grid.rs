@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use super::ExtractError;
 use super::blocks::{BlockSet, CELLS, CORNERS, POINTS, point_index};
+use crate::work::Work;
 
 /// Memory that a grid may use unless told otherwise, bytes.
 const DEFAULT_MAX_BYTES: usize = 4 << 30;
@@ -90,6 +91,14 @@ pub struct GridReport {
     pub evaluated_points: usize,
     /// Memory that the grid holds, bytes.
     pub bytes: usize,
+}
+
+impl GridReport {
+    /// What leaving out so many blocks saves.
+    pub fn work(blocks: usize) -> Work {
+        let (voxels, bytes) = ((blocks * CELLS.pow(3)) as u64, (blocks * POINTS * 4) as u64);
+        Work { voxels, bytes, ..Work::default() }
+    }
 }
 
 /// Values at the corners of the cells of some blocks of a box; everything else is unknown.

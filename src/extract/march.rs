@@ -1,22 +1,31 @@
 //! Marching cubes on a sparse grid: crack-free across blocks, each vertex made once.
 //!
 //! Two passes over the blocks, both in parallel and without any map from edges to vertices. First every block
-//! turns its corners into bit rows (inside or not), and the cut edges that it owns into bit rows as well; a
-//! running count gives every block the number of its first vertex. Then every block writes its own vertices
-//! and its cells' triangles: the number of an edge's vertex is its owner's first number, plus the count
-//! before that row, plus the cut edges before it in the row (a population count).
+//! turns its corners into bit rows (inside or not), and the cut edges that it owns into bit rows as well; running
+//! counts give every block the number of its first vertex and the place of its first triangle. Then every block
+//! writes its own vertices and its cells' triangles where they stay: it numbers its own edges one after the other,
+//! and an edge that it shares is its owner's first number, plus the count before that row, plus the cut edges before
+//! it in the row (a population count).
 //!
 //! The surface is watertight and edge-manifold wherever all cells are known and is open at the border of the
 //! unknown.
 
+use std::sync::LazyLock;
+
+use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::blocks::{BlockSet, CELLS, CORNERS, POINTS};
-use super::mc_table::{EDGES, McTable, TABLE};
+use super::blocks::{BlockSet, CELLS, CORNERS, POINTS, point_index};
+use super::march_dense::bits::{LANES, inside_word};
+use super::mc_table::{EDGES, TABLE};
 use super::{ExtractError, SparseGrid, TriMesh};
 
 /// Rows of corners in a block.
 const ROWS: usize = CORNERS * CORNERS;
+/// Corners of a row as bits.
+const ALL_CORNERS: u16 = 0x1ff;
+/// Words that hold a bit for each corner of a block, and one more to read on into.
+const WORDS: usize = POINTS.div_ceil(64) + 1;
 /// Smallest distance of a vertex from the ends of its edge, in edges. With it no triangle degenerates,
 /// whatever the values are (even all exactly at the iso-level), and the surface moves by less than 1/500
 /// voxel.
@@ -31,19 +40,21 @@ const EDGE_MARGIN: f32 = 1.0 / 512.0;
 /// `Invalid` for a non-finite `iso`; `TooLarge` for more than 2³² vertices.
 pub fn march(grid: &SparseGrid, iso: f32) -> Result<TriMesh, ExtractError> {
     ExtractError::require(iso.is_finite(), "iso", iso, "finite")?;
-    let bits: Vec<BlockBits> = grid.values.par_chunks(POINTS).map(|v| BlockBits::new(v, iso)).collect();
-    let mut cuts: Vec<Option<Box<CutEdges>>> =
-        (0..bits.len()).into_par_iter().map(|b| CutEdges::new(&bits[b], &grid.blocks, b)).collect();
-    let vertices = number_vertices(&mut cuts)?;
+    let (arch, cases) = (Arch::new(), &*CASES);
+    let mark = |(b, values)| arch.dispatch(MarkBlock { values, iso, blocks: &grid.blocks, cases, b });
+    let mut marks: Vec<Option<Box<Mark>>> = grid.values.par_chunks(POINTS).enumerate().map(mark).collect();
+    let [vertices, triangles] = number(&mut marks)?;
 
-    let mut positions = vec![[0.0; 3]; vertices];
-    let slices = split_by_block(&mut positions, &cuts);
-    slices.into_par_iter().for_each(|(b, out)| write_vertices(grid, iso, b, cuts[b].as_deref(), out));
-
-    let cells = Cells { blocks: &grid.blocks, bits: &bits, cuts: &cuts, table: &TABLE };
-    let triangles: Vec<Vec<[u32; 3]>> = (0..bits.len()).into_par_iter().map(|b| cells.triangles(b)).collect();
-    let mut mesh = TriMesh { positions, triangles: triangles.concat() };
-    if bits.iter().any(|b| b.has_unknown) {
+    // Zeroed by the system, page by page, when a thread first writes there.
+    let mut mesh = TriMesh { positions: vec![[0.0; 3]; vertices], triangles: vec![[0; 3]; triangles] };
+    let marked = || marks.iter().flatten();
+    let positions = split(&mut mesh.positions, marked().map(|m| usize::from(m.vertices)));
+    let triangles = split(&mut mesh.triangles, marked().map(|m| usize::from(m.triangles)));
+    let blocks: Vec<usize> = (0..marks.len()).filter(|&b| marks[b].is_some()).collect();
+    blocks.into_par_iter().zip(positions).zip(triangles).for_each(|((b, positions), triangles)| {
+        arch.dispatch(WriteBlock { grid, iso, marks: &marks, cases, b, positions, triangles });
+    });
+    if marked().any(|m| m.known.is_some()) {
         // An edge between two known corners may lie on unknown cells only.
         mesh.drop_unused_vertices();
     }
@@ -51,98 +62,225 @@ pub fn march(grid: &SparseGrid, iso: f32) -> Result<TriMesh, ExtractError> {
 }
 
 /// Where the surface crosses an edge whose ends have the values `a` and `b`, in edges from `a`.
-#[inline]
+#[inline(always)]
 pub(crate) fn crossing(a: f32, b: f32, iso: f32) -> f32 {
     // `max` and `min` instead of `clamp`: they also settle inf/inf, which opposite huge values give.
     #[allow(clippy::manual_clamp)]
     ((iso - a) / (b - a)).max(EDGE_MARGIN).min(1.0 - EDGE_MARGIN)
 }
 
-/// The corners of a block as bit rows, bit x = corner x.
-struct BlockBits {
-    inside: [u16; ROWS],
-    known: [u16; ROWS],
-    has_unknown: bool,
-    /// Both inside and outside corners occur.
-    mixed: bool,
-}
+/// Bits of the corners of a block: bit x of row z · [`CORNERS`] + y.
+type Rows = [u16; ROWS];
 
-impl BlockBits {
-    fn new(values: &[f32], iso: f32) -> Self {
-        let mut bits = Self { inside: [0; ROWS], known: [0; ROWS], has_unknown: false, mixed: false };
-        let (mut any, mut all) = (0, 0x1ff);
-        for (row, values) in values.chunks_exact(CORNERS).enumerate() {
-            let (mut inside, mut known) = (0u16, 0u16);
-            for (x, &v) in values.iter().enumerate() {
-                inside |= u16::from(v > iso) << x;
-                known |= u16::from(!v.is_nan()) << x;
-            }
-            bits.inside[row] = inside;
-            bits.known[row] = known;
-            bits.has_unknown |= known != 0x1ff;
-            any |= inside;
-            all &= inside;
-        }
-        bits.mixed = any != 0 && all != 0x1ff;
-        bits
-    }
-}
-
-/// The cut edges that a block owns, and their vertices' numbers.
-struct CutEdges {
+/// A block with a surface, and what it counts of it.
+struct Mark {
+    inside: Rows,
+    /// `None`: all are.
+    known: Option<Box<Rows>>,
     /// Number of the block's first vertex.
     first: u32,
-    count: u16,
-    /// Per axis and row: bit x = the edge that starts at corner x is cut and owned.
-    rows: [[u16; ROWS]; 3],
-    /// Per axis and row: vertices of the block before this row.
+    vertices: u16,
+    triangles: u16,
+    /// Per axis: the edges that start at these corners are cut, and the block's own.
+    own: [Rows; 3],
+    /// Per axis and row: the block's vertices before this row.
     before: [[u16; ROWS]; 3],
 }
 
-impl CutEdges {
-    fn new(bits: &BlockBits, blocks: &BlockSet, b: usize) -> Option<Box<Self>> {
-        if !bits.mixed {
-            return None;
-        }
-        let mut cuts = Box::new(Self { first: 0, count: 0, rows: [[0; ROWS]; 3], before: [[0; ROWS]; 3] });
-        for axis in 0..3 {
-            for row in 0..ROWS {
-                let (y, z) = (row % CORNERS, row / CORNERS);
-                let owned = blocks.owned_edges(b, axis, y, z);
-                cuts.before[axis][row] = cuts.count;
-                if owned == 0 {
-                    continue;
-                }
-                let (inside, known) = match axis {
-                    0 => (bits.inside[row] >> 1, bits.known[row] >> 1),
-                    1 => (bits.inside[row + 1], bits.known[row + 1]),
-                    _ => (bits.inside[row + CORNERS], bits.known[row + CORNERS]),
-                };
-                let cut = (bits.inside[row] ^ inside) & bits.known[row] & known & owned;
-                cuts.rows[axis][row] = cut;
-                cuts.count += cut.count_ones() as u16;
-            }
-        }
-        Some(cuts)
+impl Mark {
+    /// Bits of the edges along `axis` from corners of a row that are cut, between known corners.
+    #[inline(always)]
+    fn cut(&self, axis: usize, row: usize) -> u16 {
+        // A row of corners has one edge less along itself.
+        let mask = if axis == 0 { ALL_CORNERS >> 1 } else { ALL_CORNERS };
+        let [a, b] = ends(&self.inside, axis, row);
+        let Some(known) = &self.known else { return (a ^ b) & mask };
+        let [here, there] = ends(known, axis, row);
+        (a ^ b) & here & there & mask
     }
 
-    #[inline]
+    /// Marks the block's own cut edges and counts them.
+    #[inline(always)]
+    fn mark_own(&mut self, blocks: &BlockSet, b: usize) {
+        for axis in 0..3 {
+            // Ownership only changes at the sides.
+            let mut owned = [[0; 3]; 3];
+            for (z, owned) in [0, 1, CELLS].into_iter().zip(&mut owned) {
+                for (y, owned) in [0, 1, CELLS].into_iter().zip(owned) {
+                    *owned = blocks.owned_edges(b, axis, y, z);
+                }
+            }
+            for z in 0..edge_rows(axis, 2) {
+                for y in 0..edge_rows(axis, 1) {
+                    let row = z * CORNERS + y;
+                    let own = self.cut(axis, row) & owned[side(z)][side(y)];
+                    self.own[axis][row] = own;
+                    self.before[axis][row] = self.vertices;
+                    self.vertices += own.count_ones() as u16;
+                }
+            }
+        }
+    }
+
+    /// Number of the vertex on the own edge along `axis` from corner `p`.
+    #[inline(always)]
     fn vertex(&self, axis: usize, p: [usize; 3]) -> u32 {
         let row = p[2] * CORNERS + p[1];
-        let before_in_row = (self.rows[axis][row] & ((1 << p[0]) - 1)).count_ones();
+        let before_in_row = (self.own[axis][row] & ((1 << p[0]) - 1)).count_ones();
         self.first + u32::from(self.before[axis][row]) + before_in_row
+    }
+
+    /// The cells between row `row` and its neighbours along y and z.
+    // No closures here and where it is called: they may be compiled without the caller's vector features.
+    #[inline(always)]
+    fn cells(&self, row: usize) -> Cells {
+        let rows = around(&self.inside, row);
+        let (some, every) = (rows[0] | rows[1] | rows[2] | rows[3], rows[0] & rows[1] & rows[2] & rows[3]);
+        let mut active = (some | some >> 1) & !(every & every >> 1) & 0xff;
+        if let (Some(known), true) = (&self.known, active != 0) {
+            let [a, b, c, d] = around(known, row);
+            let known = a & b & c & d;
+            active &= known & known >> 1;
+        }
+        Cells { rows, active }
     }
 }
 
-/// Gives every block the number of its first vertex; returns the number of vertices.
-fn number_vertices(cuts: &mut [Option<Box<CutEdges>>]) -> Result<usize, ExtractError> {
-    let mut total = 0usize;
-    for cuts in cuts.iter_mut().flatten() {
-        cuts.first = total as u32;
-        total += usize::from(cuts.count);
+/// The rows at both ends of the edges along `axis` from a row's corners.
+#[inline(always)]
+fn ends(rows: &Rows, axis: usize, row: usize) -> [u16; 2] {
+    match axis {
+        0 => [rows[row], rows[row] >> 1],
+        1 => [rows[row], rows[row + 1]],
+        _ => [rows[row], rows[row + CORNERS]],
     }
-    check_vertex_count(total)?;
-    Ok(total)
+}
+
+/// A row of corners, and the next ones along y, z and both.
+#[inline(always)]
+fn around(rows: &Rows, row: usize) -> [u32; 4] {
+    [rows[row].into(), rows[row + 1].into(), rows[row + CORNERS].into(), rows[row + CORNERS + 1].into()]
+}
+
+/// A row of cells: those that are left of the known ones on the surface.
+struct Cells {
+    rows: [u32; 4],
+    active: u32,
+}
+
+impl Cells {
+    /// Place along the row and case of the next cell.
+    #[inline(always)]
+    fn next(&mut self) -> Option<(usize, usize)> {
+        if self.active == 0 {
+            return None;
+        }
+        let x = self.active.trailing_zeros();
+        self.active &= self.active - 1;
+        let [a, b, c, d] = self.rows;
+        let case = (a >> x & 3) | (b >> x & 3) << 2 | (c >> x & 3) << 4 | (d >> x & 3) << 6;
+        Some((x as usize, case as usize))
+    }
+}
+
+/// Rows of corners from which cells start.
+#[inline(always)]
+fn cell_rows() -> impl Iterator<Item = usize> {
+    (0..CELLS * CELLS).map(|n| n / CELLS * CORNERS + n % CELLS)
+}
+
+/// Rows of corners along y (1) or z (2) from which edges along `axis` start.
+#[inline(always)]
+fn edge_rows(axis: usize, along: usize) -> usize {
+    if axis == along { CELLS } else { CORNERS }
+}
+
+/// 0 on the low side of a block, 2 on the high side, 1 between.
+#[inline(always)]
+fn side(v: usize) -> usize {
+    usize::from(v != 0) + usize::from(v == CELLS)
+}
+
+/// Turns a block's values into bits and counts its part of the surface; `None` where it has none.
+struct MarkBlock<'a> {
+    values: &'a [f32],
+    iso: f32,
+    blocks: &'a BlockSet,
+    cases: &'a [Case; 256],
+    b: usize,
+}
+
+impl WithSimd for MarkBlock<'_> {
+    type Output = Option<Box<Mark>>;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> Self::Output {
+        let Self { values, iso, blocks, cases, b } = self;
+        let (mut words, mut exponents) = ([0; WORDS], [0; LANES]);
+        let (whole, rest) = values.as_chunks::<64>();
+        for (word, values) in words.iter_mut().zip(whole) {
+            *word = inside_word(values, iso, &mut exponents);
+        }
+        // A value at the iso-level is outside.
+        let mut last = [iso; 64];
+        last[..rest.len()].copy_from_slice(rest);
+        words[whole.len()] = inside_word(&last, iso, &mut exponents);
+        let inside = words.iter().map(|w| w.count_ones() as usize).sum::<usize>();
+        if inside == 0 || inside == POINTS {
+            return None;
+        }
+        let not_finite = exponents.iter().fold(0, |all, e| all | e) >> 31 != 0;
+        let known = not_finite.then(|| Box::new(known_rows(values)));
+        let mut mark = Box::new(Mark {
+            inside: rows_of(&words),
+            known: known.filter(|rows| rows.iter().any(|row| *row != ALL_CORNERS)),
+            first: 0,
+            vertices: 0,
+            triangles: 0,
+            own: [[0; ROWS]; 3],
+            before: [[0; ROWS]; 3],
+        });
+        mark.mark_own(blocks, b);
+        for row in cell_rows() {
+            let mut cells = mark.cells(row);
+            while let Some((_, case)) = cells.next() {
+                mark.triangles += u16::from(cases[case].count);
+            }
+        }
+        Some(mark)
+    }
+}
+
+/// Cuts a stream of bits into rows.
+#[inline(always)]
+fn rows_of(words: &[u64; WORDS]) -> Rows {
+    let mut rows = [0; ROWS];
+    for (r, row) in rows.iter_mut().enumerate() {
+        let (word, bit) = (r * CORNERS / 64, r * CORNERS % 64);
+        let both = u128::from(words[word]) | u128::from(words[word + 1]) << 64;
+        *row = (both >> bit) as u16 & ALL_CORNERS;
+    }
+    rows
+}
+
+fn known_rows(values: &[f32]) -> Rows {
+    let mut rows = [0; ROWS];
+    for (row, values) in rows.iter_mut().zip(values.chunks_exact(CORNERS)) {
+        *row = values.iter().enumerate().fold(0, |row, (x, v)| row | u16::from(!v.is_nan()) << x);
+    }
+    rows
+}
+
+/// Gives every block the number of its first vertex; returns the numbers of vertices and triangles.
+fn number(marks: &mut [Option<Box<Mark>>]) -> Result<[usize; 2], ExtractError> {
+    let [mut vertices, mut triangles] = [0usize; 2];
+    for mark in marks.iter_mut().flatten() {
+        mark.first = vertices as u32;
+        vertices += usize::from(mark.vertices);
+        triangles += usize::from(mark.triangles);
+    }
+    check_vertex_count(vertices)?;
+    Ok([vertices, triangles])
 }
 
 /// # Errors
@@ -155,38 +293,86 @@ pub(crate) fn check_vertex_count(total: usize) -> Result<(), ExtractError> {
     Err(ExtractError::TooLarge { what: "the mesh", needed_mb: mb(total), limit_mb: mb(u32::MAX as usize) })
 }
 
-/// Splits the vertex array into the blocks' own parts.
-fn split_by_block<'a>(
-    mut rest: &'a mut [[f32; 3]],
-    cuts: &[Option<Box<CutEdges>>],
-) -> Vec<(usize, &'a mut [[f32; 3]])> {
-    let mut slices = Vec::new();
-    for (b, cuts) in cuts.iter().enumerate() {
-        let Some(cuts) = cuts else { continue };
-        let (head, tail) = rest.split_at_mut(usize::from(cuts.count));
-        slices.push((b, head));
-        rest = tail;
-    }
-    slices
+/// Splits an array into parts of these lengths.
+pub(crate) fn split<T>(mut rest: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
+    let next = |length| rest.split_off_mut(..length).unwrap_or_default();
+    lengths.map(next).collect()
 }
 
-fn write_vertices(grid: &SparseGrid, iso: f32, b: usize, cuts: Option<&CutEdges>, out: &mut [[f32; 3]]) {
-    let Some(cuts) = cuts else { return };
-    let values = &grid.values[b * POINTS..(b + 1) * POINTS];
-    let first = grid.blocks.coords()[b].map(|c| c as usize * CELLS);
-    let mut out = out.iter_mut();
-    for axis in 0..3 {
-        let step = [1, CORNERS, ROWS][axis];
-        for (row, &cut) in cuts.rows[axis].iter().enumerate() {
-            for x in set_bits(cut) {
-                let i = row * CORNERS + x;
-                let mut p = [x, row % CORNERS, row / CORNERS];
-                let t = crossing(values[i], values[i + step], iso);
-                for a in 0..3 {
-                    p[a] += first[a];
+/// Writes a block's vertices and triangles.
+struct WriteBlock<'a> {
+    grid: &'a SparseGrid,
+    iso: f32,
+    marks: &'a [Option<Box<Mark>>],
+    cases: &'a [Case; 256],
+    b: usize,
+    positions: &'a mut [[f32; 3]],
+    triangles: &'a mut [[u32; 3]],
+}
+
+impl WithSimd for WriteBlock<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, _: S) {
+        let Some(mark) = self.marks[self.b].as_deref() else { return };
+        // By axis and first corner; of edges that are not cut nobody asks.
+        let mut numbers = [0; 3 * POINTS];
+        self.number_edges(mark, &mut numbers);
+        let mut next = 0;
+        for row in cell_rows() {
+            let mut cells = mark.cells(row);
+            while let Some((x, case)) = cells.next() {
+                let (case, first) = (&self.cases[case & 255], row * CORNERS + x);
+                let count = usize::from(case.count);
+                let Some(out) = self.triangles.get_mut(next..next + count) else { return };
+                for (to, places) in out.iter_mut().zip(&case.places) {
+                    for k in 0..3 {
+                        to[k] = numbers[first + usize::from(places[k])];
+                    }
                 }
-                if let Some(out) = out.next() {
-                    *out = vertex_position(p, axis, t, grid.spec.voxel);
+                next += count;
+            }
+        }
+    }
+}
+
+impl WriteBlock<'_> {
+    /// Writes the vertices of the block's own edges and finds the numbers of all its cut edges.
+    #[inline(always)]
+    fn number_edges(&mut self, mark: &Mark, numbers: &mut [u32; 3 * POINTS]) {
+        let Self { grid, iso, marks, b, .. } = *self;
+        let values = &grid.values[b * POINTS..(b + 1) * POINTS];
+        let [x0, y0, z0] = grid.blocks.coords()[b].map(|c| c as usize * CELLS);
+        let mut next = mark.first;
+        let mut out = self.positions.iter_mut();
+        for axis in 0..3 {
+            let step = [1, CORNERS, ROWS][axis];
+            for z in 0..edge_rows(axis, 2) {
+                for y in 0..edge_rows(axis, 1) {
+                    let row = z * CORNERS + y;
+                    let mut own = mark.own[axis][row];
+                    let mut others = mark.cut(axis, row) & !own;
+                    while own != 0 {
+                        let x = own.trailing_zeros() as usize;
+                        own &= own - 1;
+                        let i = row * CORNERS + x;
+                        numbers[axis * POINTS + i] = next;
+                        next += 1;
+                        let t = crossing(values[i], values[i + step], iso);
+                        let p = [x0 + x, y0 + y, z0 + z];
+                        if let Some(out) = out.next() {
+                            *out = vertex_position(p, axis, t, grid.spec.voxel);
+                        }
+                    }
+                    while others != 0 {
+                        let x = others.trailing_zeros() as usize;
+                        others &= others - 1;
+                        let (owner, p) = grid.blocks.owner(b, [x, y, z], Some(axis));
+                        // A cut edge has a cut in its owner too, because both store the same corners.
+                        let number = marks[owner].as_deref().map_or(u32::MAX, |owner| owner.vertex(axis, p));
+                        numbers[axis * POINTS + row * CORNERS + x] = number;
+                    }
                 }
             }
         }
@@ -194,63 +380,32 @@ fn write_vertices(grid: &SparseGrid, iso: f32, b: usize, cuts: Option<&CutEdges>
 }
 
 /// The point at `t` along the edge that starts at corner `p` and runs along `axis`.
-#[inline]
-pub(crate) fn vertex_position(p: [usize; 3], axis: usize, t: f32, voxel: f64) -> [f32; 3] {
-    let mut at = p.map(|c| c as f64);
+#[inline(always)]
+fn vertex_position(p: [usize; 3], axis: usize, t: f32, voxel: f64) -> [f32; 3] {
+    let mut at = [p[0] as f64, p[1] as f64, p[2] as f64];
     at[axis] += f64::from(t);
-    at.map(|c| (c * voxel) as f32)
+    [(at[0] * voxel) as f32, (at[1] * voxel) as f32, (at[2] * voxel) as f32]
 }
 
-/// Positions of the set bits, lowest first.
-#[inline]
-fn set_bits(mut bits: u16) -> impl Iterator<Item = usize> {
-    std::iter::from_fn(move || {
-        let x = bits.trailing_zeros();
-        bits &= bits.checked_sub(1)?;
-        Some(x as usize)
+/// The triangles of a case of marching cubes.
+#[derive(Clone, Copy, Default)]
+struct Case {
+    count: u8,
+    /// Corners of the triangles: an edge's place by axis and first corner, relative to the cell's first corner.
+    places: [[u16; 3]; 5],
+}
+
+static CASES: LazyLock<[Case; 256]> = LazyLock::new(|| {
+    std::array::from_fn(|case| {
+        let triangles = TABLE.triangles(case as u8);
+        let mut found = Case { count: triangles.len() as u8, ..Case::default() };
+        let place = |e: u8| {
+            let (axis, offset) = EDGES[usize::from(e)];
+            (axis * POINTS + point_index(offset)) as u16
+        };
+        for (places, edges) in found.places.iter_mut().zip(triangles) {
+            *places = edges.map(place);
+        }
+        found
     })
-}
-
-/// What the second pass looks at.
-struct Cells<'a> {
-    blocks: &'a BlockSet,
-    bits: &'a [BlockBits],
-    cuts: &'a [Option<Box<CutEdges>>],
-    table: &'a McTable,
-}
-
-impl Cells<'_> {
-    fn triangles(&self, b: usize) -> Vec<[u32; 3]> {
-        let bits = &self.bits[b];
-        let mut out = Vec::new();
-        if !bits.mixed {
-            return out;
-        }
-        for z in 0..CELLS {
-            for y in 0..CELLS {
-                let rows = [0, 1, CORNERS, CORNERS + 1].map(|r| z * CORNERS + y + r);
-                let inside = rows.map(|r| bits.inside[r]);
-                let any = inside.iter().fold(0, |m, r| m | r | r >> 1);
-                let all = inside.iter().fold(0xff, |m, r| m & r & r >> 1);
-                let known = rows.iter().fold(0xff, |m, &r| m & bits.known[r] & bits.known[r] >> 1);
-                for x in set_bits(any & !all & known) {
-                    let pair = |r: usize| (inside[r] >> x & 3) as u8;
-                    let case = pair(0) | pair(1) << 2 | pair(2) << 4 | pair(3) << 6;
-                    let triangles = self.table.triangles(case);
-                    out.extend(triangles.iter().map(|t| t.map(|e| self.vertex(b, [x, y, z], e))));
-                }
-            }
-        }
-        out
-    }
-
-    /// Number of the vertex on edge `e` of cell `cell` of block `b`.
-    #[inline]
-    fn vertex(&self, b: usize, cell: [usize; 3], e: u8) -> u32 {
-        let (axis, offset) = EDGES[usize::from(e)];
-        let p = std::array::from_fn(|a| cell[a] + offset[a]);
-        let (owner, p) = self.blocks.owner(b, p, Some(axis));
-        // A cut edge has a cut in its owner too, because both store the same corners.
-        self.cuts[owner].as_deref().map_or(u32::MAX, |cuts| cuts.vertex(axis, p))
-    }
-}
+});

@@ -4,7 +4,7 @@ use std::collections::HashSet;
 
 use glam::{Vec3A, Vec3Swizzles};
 
-use super::testing::{area, assert_manifold, euler_characteristic, grid, grid_where, noise};
+use super::testing::{area, assert_manifold, euler_characteristic, grid, grid_where, noise, soup};
 use super::{ExtractError, GridSpec, SparseGrid, TriMesh, march, march_dense};
 
 const CENTER: Vec3A = Vec3A::splat(0.5);
@@ -171,17 +171,6 @@ fn dense_grids_of_every_shape_are_manifold_and_whole() {
         assert_eq!(mesh.positions.len(), (0..3).map(cuts).sum::<usize>(), "{dims:?}");
         assert!(mesh.triangles.iter().flatten().all(|v| (*v as usize) < mesh.positions.len()));
     }
-}
-
-/// Triangles by the exact positions of their corners, rotated to a canonical first corner.
-fn soup(mesh: &TriMesh, scale: f32) -> HashSet<[[u32; 3]; 3]> {
-    let key = |t: &[u32; 3]| {
-        let mut t = t.map(|v| mesh.positions[v as usize].map(|c| (c * scale).to_bits()));
-        let least = (0..3).min_by_key(|&i| t[i]).unwrap();
-        t.rotate_left(least);
-        t
-    };
-    mesh.triangles.iter().map(key).collect()
 }
 
 #[test]

@@ -27,7 +27,7 @@ pub mod visibility;
 #[cfg(test)]
 mod march_tests;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 #[cfg(test)]
 mod tsdf_tests;
 

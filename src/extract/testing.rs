@@ -70,3 +70,14 @@ pub(crate) fn euler_characteristic(mesh: &TriMesh) -> i64 {
 pub(crate) fn area(mesh: &TriMesh) -> f64 {
     (0..mesh.triangles.len()).map(|t| mesh.area(t)).sum()
 }
+
+/// Triangles by the exact positions of their corners, rotated to a canonical first corner.
+pub(crate) fn soup(mesh: &TriMesh, scale: f32) -> HashSet<[[u32; 3]; 3]> {
+    let key = |t: &[u32; 3]| {
+        let mut t = t.map(|v| mesh.positions[v as usize].map(|c| (c * scale).to_bits()));
+        let least = (0..3).min_by_key(|&i| t[i]).unwrap();
+        t.rotate_left(least);
+        t
+    };
+    mesh.triangles.iter().map(key).collect()
+}

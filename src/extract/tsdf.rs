@@ -69,6 +69,16 @@ impl TsdfVolume {
     /// all pixels of all frames in order; "camera": index of the frame; "fused depth": index of the corner over
     /// all blocks that are near the depth), `Invalid` and `TooLarge` as the grid.
     pub fn fuse(spec: &GridSpec, frames: &[DepthFrame], options: &TsdfOptions) -> Result<Self, ExtractError> {
+        Self::fuse_in(spec, frames, options, || mark_blocks(spec, frames, options))
+    }
+
+    /// As [`Self::fuse`], in these blocks alone.
+    pub(super) fn fuse_in(
+        spec: &GridSpec,
+        frames: &[DepthFrame],
+        options: &TsdfOptions,
+        blocks: impl FnOnce() -> BlockSet,
+    ) -> Result<Self, ExtractError> {
         spec.validate()?;
         let positive = options.truncation.is_finite() && options.truncation > 0.0;
         ExtractError::require(positive, "truncation", options.truncation, "a positive length")?;
@@ -77,8 +87,7 @@ impl TsdfVolume {
         ExtractError::require(options.max_depth > 0.0, "max_depth", options.max_depth, "positive")?;
         check_frames(frames)?;
         let maps = Map::all(spec, frames, options)?;
-        let blocks = mark_blocks(spec, frames, options);
-        let mut grid = SparseGrid::unknown(spec, blocks)?;
+        let mut grid = SparseGrid::unknown(spec, blocks())?;
         let colored = !frames.is_empty() && frames.iter().all(|f| f.rgb.is_some());
         let count = grid.values.len();
         let color_bytes = if colored { 12 } else { 0 };

@@ -2,9 +2,10 @@
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, Vec3A};
 
-use super::testing::assert_manifold;
+use super::blocks::BlockSet;
+use super::testing::{assert_manifold, soup};
 use super::tsdf::{DepthFrame, TsdfOptions, TsdfVolume};
-use super::{ExtractError, GridSpec, TriMesh};
+use super::{ExtractError, GridReport, GridSpec, TriMesh};
 use crate::scene::{Camera, Pose};
 
 /// A room 4 × 3 × 2.5 in which a box stands, far from the world's origin.
@@ -195,4 +196,21 @@ fn fusion_does_not_depend_on_the_number_of_threads() {
         })
     };
     assert_eq!(run(1), run(3));
+}
+
+#[test]
+fn blocks_without_depth_hold_nothing() {
+    let shots = shots([0.0; 4]);
+    let (frames, spec) = (frames(&shots), spec());
+    let options = TsdfOptions::for_voxel(VOXEL);
+    let near = TsdfVolume::fuse(&spec, &frames, &options).unwrap();
+    let [nx, ny, nz] = spec.block_dims();
+    let all = (0..nz).flat_map(|z| (0..ny).flat_map(move |y| (0..nx).map(move |x| [x, y, z])));
+    let all = BlockSet::new(spec.block_dims(), all.collect());
+    let everywhere = TsdfVolume::fuse_in(&spec, &frames, &options, || all).unwrap();
+    let report = near.grid().report();
+    assert!(report.skipped_blocks * 4 > everywhere.grid().report().evaluated_blocks, "{report:?}");
+    assert_eq!(GridReport::work(report.skipped_blocks).voxels, 512 * report.skipped_blocks as u64);
+    let (near, everywhere) = (near.mesh().unwrap(), everywhere.mesh().unwrap());
+    assert_eq!(soup(&near, 1.0), soup(&everywhere, 1.0));
 }

@@ -1,5 +1,8 @@
 //! From a trained field to its map, stage by stage.
 
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use divff_exporters::Geometry;
 use glam::{Vec3, Vec3A};
 
@@ -7,12 +10,13 @@ use super::config::MapConfig;
 use super::error::MapError;
 use super::{MapObject, SemanticMap, Skipped, moving, persistent, place, points, times, views};
 use crate::config::Config;
-use crate::extract::GridSpec;
+use crate::extract::{GridReport, GridSpec};
 use crate::field::Stream;
 use crate::render::forward::Model;
 use crate::render::sampler::Sampling;
 use crate::scene::Scene;
 use crate::train::Trained;
+use crate::work::Work;
 
 /// The stages of [`build`] in order, and the one after it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -52,6 +56,8 @@ pub(super) struct Context<'a> {
     pub(super) voxel: f64,
     pub(super) spec: GridSpec,
     pub(super) offset: [f64; 3],
+    /// Blocks of all grids in which there was nothing to look at. A count: in which order it grows does not matter.
+    skipped_blocks: AtomicUsize,
 }
 
 /// The map as far as it is built.
@@ -82,11 +88,13 @@ pub fn build(
     moving::extract_dynamic(&mut b, &seen, &moments)?;
     moving::extract_actor(&mut b, &moments)?;
     points::sample(&mut b)?;
+    let blocks = b.cx.skipped_blocks.load(Ordering::Relaxed);
+    b.save("empty_blocks", GridReport::work(blocks));
     Ok(b.map)
 }
 
 impl<'a> Builder<'a> {
-    fn new(
+    pub(super) fn new(
         scene: &'a Scene,
         trained: &'a Trained,
         config: &'a Config,
@@ -103,6 +111,7 @@ impl<'a> Builder<'a> {
             features: Vec::new(),
             affordances: Vec::new(),
             skipped: Vec::new(),
+            saved: BTreeMap::new(),
             simplified: Vec::new(),
             up_axis,
             up_is_known,
@@ -120,6 +129,7 @@ impl<'a> Builder<'a> {
             voxel,
             spec: place::grid(&n, voxel),
             offset: place::offset(&n, voxel),
+            skipped_blocks: AtomicUsize::new(0),
         };
         Self { cx, map, progress }
     }
@@ -130,6 +140,11 @@ impl<'a> Builder<'a> {
 
     pub(super) fn skip(&mut self, what: impl Into<String>, why: impl Into<String>) {
         self.map.skipped.push(Skipped { what: what.into(), why: why.into() });
+    }
+
+    /// Notes work that was saved.
+    pub(super) fn save(&mut self, what: &'static str, work: Work) {
+        *self.map.saved.entry(what).or_default() += work;
     }
 
     /// Adds an object with a geometry of its own; one without triangles is skipped. Whether it was added.
@@ -163,6 +178,11 @@ impl Context<'_> {
     pub(super) fn to_unit(&self, p: Vec3A) -> Vec3 {
         let n = &self.model.field.normalisation;
         (Vec3::from(p) / n.scale as f32).clamp(Vec3::ZERO, n.extent)
+    }
+
+    /// Notes what a grid left out.
+    pub(super) fn count(&self, report: GridReport) {
+        self.skipped_blocks.fetch_add(report.skipped_blocks, Ordering::Relaxed);
     }
 
     /// Length in units over which a density is turned into the opacity that is marched at one half.

@@ -14,12 +14,16 @@ mod persistent;
 mod place;
 mod points;
 mod simplify;
+#[cfg(test)]
+mod skip_tests;
 mod surface;
 #[cfg(test)]
 mod tests;
 mod times;
 mod views;
 mod write;
+
+use std::collections::BTreeMap;
 
 use divff_exporters::manifest::SimplifiedEntry;
 use divff_exporters::{Geometry, Interval, UpAxis};
@@ -32,6 +36,7 @@ pub use self::place::default_voxel;
 pub use self::simplify::simplify;
 pub use self::write::{Format, write};
 use crate::field::{Normalisation, Stream};
+use crate::work::Work;
 
 /// A scene's map: geometry in world coordinates (minus one common offset), with attributes per vertex.
 #[derive(Clone, Debug)]
@@ -45,6 +50,8 @@ pub struct SemanticMap {
     pub points: Geometry,
     /// What was left out or shared, and why.
     pub skipped: Vec<Skipped>,
+    /// Work that was saved, by what saved it.
+    pub saved: BTreeMap<&'static str, Work>,
     /// What [`simplify`] did to each geometry.
     pub simplified: Vec<SimplifiedEntry>,
     /// Features that the geometries have.

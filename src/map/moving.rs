@@ -23,6 +23,7 @@ use crate::render::query::Query;
 use crate::render::refined::refined_camera;
 use crate::scene::{Camera, Frame, Pose};
 use crate::simd::one_minus_exp_neg;
+use crate::work::Work;
 
 /// A pixel shows a stream where it takes more than this share of the light.
 const SHOWN: f32 = 0.5;
@@ -52,6 +53,9 @@ pub(super) fn extract_dynamic(
             && before.iter().zip(&now).all(|(a, b)| (a - b).abs() <= CHANGED)
         {
             b.skip(name, format!("nothing changed since {of}; its geometry is shared"));
+            let frames = nearest(&b.cx, moment.frame);
+            let rays = views::pixels(&frames, stride(&b.cx, &frames));
+            b.save("unchanged_times", Work::samples(rays * b.cx.sampling.count as u64));
             b.map.objects.extend(geometry.map(|geometry| MapObject { geometry, ..object }));
             continue;
         }
@@ -127,8 +131,9 @@ fn fused(
     let maps: Vec<DepthMap> = frames.iter().map(shown).collect();
     let depths: Vec<DepthFrame> = maps.iter().map(views::depth_frame).collect();
     let options = TsdfOptions { truncation: spread, min_weight: 0.0, max_depth: f32::INFINITY };
-    let volume = TsdfVolume::fuse(&cx.spec, &depths, &options);
-    let mut mesh = volume.and_then(|v| v.mesh()).map_err(MapError::extract(name))?;
+    let volume = TsdfVolume::fuse(&cx.spec, &depths, &options).map_err(MapError::extract(name))?;
+    cx.count(volume.grid().report());
+    let mut mesh = volume.mesh().map_err(MapError::extract(name))?;
     smooth(&mut mesh, cx.config.smoothing, 0.5 * cx.voxel as f32);
     let normals = vertex_normals(&mesh);
     let surface = Surface::seen_from(cx, name, mesh, normals, views)?;

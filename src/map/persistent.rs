@@ -67,6 +67,7 @@ fn fused(cx: &Context, seen: &[SeenFrame]) -> Result<TriMesh, MapError> {
         Ok(volume) => volume,
         Err(e) => return Err(failed(e)),
     };
+    cx.count(volume.grid().report());
     let query = Query::new(&cx.model, Stream::Persistent, 0.0);
     match (cx.config.method, query) {
         (SurfaceMethod::Both, Some(query)) => {
@@ -96,7 +97,9 @@ pub(super) fn opacity_grid(cx: &Context, query: &Query) -> Result<SparseGrid, Ma
     };
     let length = cx.opaque_length();
     let value = |p: &[Vec3A], out: &mut [f32]| opacity(query, p, out, length, |p| cx.to_unit(p));
-    SparseGrid::sample(&cx.spec, &may_hold, &value).map_err(MapError::extract(s.name()))
+    let grid = SparseGrid::sample(&cx.spec, &may_hold, &value).map_err(MapError::extract(s.name()))?;
+    cx.count(grid.report());
+    Ok(grid)
 }
 
 /// 1 − e^(−σ δ) at positions relative to the grid's origin: bounded, so that linear interpolation between corners

@@ -17,11 +17,11 @@ use crate::train::checkpoint::TrainingState;
 
 /// Density grid cells along the box.
 const CELLS: f32 = 16.0;
-const HERE: DVec3 = DVec3::new(10.0, 20.0, 30.0);
+pub(super) const HERE: DVec3 = DVec3::new(10.0, 20.0, 30.0);
 
 /// A field whose density grids leave only a slab of the persistent stream (and of the dynamic one, on request), which
 /// the networks fill with dense fog: a wall across the cameras' view.
-fn trained(streams: [bool; 3], origin: DVec3, slab: [bool; 3]) -> Trained {
+pub(super) fn trained(streams: [bool; 3], origin: DVec3, slab: [bool; 3]) -> Trained {
     let mut field = field_at(streams, origin);
     for net in field.nets.iter_mut().flatten() {
         net.density_bias = 5.0;
@@ -45,7 +45,7 @@ fn still(field: &mut Field) {
     field.weights[codes].fill(0.0);
 }
 
-fn scene(folder: &Path, origin: DVec3) -> Scene {
+pub(super) fn scene(folder: &Path, origin: DVec3) -> Scene {
     let frames = [0.0, 0.25, 0.5, 0.75, 1.0].map(|t| {
         let mut frame = frame_at(t, origin);
         frame.image_path = folder.join("grey.png");
@@ -64,12 +64,12 @@ fn scene(folder: &Path, origin: DVec3) -> Scene {
     }
 }
 
-fn config(overlay: &str) -> Config {
+pub(super) fn config(overlay: &str) -> Config {
     let base = "[map]\nvoxel_size = 0.08\npoints = 500\nmin_component_voxels = 3.0\n";
     Config::default().overlaid(&format!("{base}{overlay}"), "test").unwrap()
 }
 
-fn map_of(trained: &Trained, origin: DVec3, overlay: &str) -> SemanticMap {
+pub(super) fn map_of(trained: &Trained, origin: DVec3, overlay: &str) -> SemanticMap {
     let folder = tempfile::tempdir().unwrap();
     build(&scene(folder.path(), origin), trained, &config(overlay), &mut |_| {}).unwrap()
 }

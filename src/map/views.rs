@@ -81,13 +81,15 @@ pub(super) fn look(cx: &Context, frame: &Frame, stride: u32) -> Result<SeenFrame
 
 /// The smallest reduction with which all frames together have at most `rays` pixels.
 pub(super) fn stride(frames: &[&Frame], rays: usize) -> u32 {
-    let pixels = |stride: u32| -> u64 {
-        let of = |f: &&Frame| {
-            u64::from((f.camera.width / stride).max(1)) * u64::from((f.camera.height / stride).max(1))
-        };
-        frames.iter().map(of).sum()
+    (1..64).find(|&s| pixels(frames, s) <= rays as u64).unwrap_or(64)
+}
+
+/// Pixels of all frames, reduced by `stride`.
+pub(super) fn pixels(frames: &[&Frame], stride: u32) -> u64 {
+    let of = |f: &&Frame| {
+        u64::from((f.camera.width / stride).max(1)) * u64::from((f.camera.height / stride).max(1))
     };
-    (1..64).find(|&s| pixels(s) <= rays as u64).unwrap_or(64)
+    frames.iter().map(of).sum()
 }
 
 /// Means over squares of `stride` pixels, in sRGB like every other mean over what the video shows.

@@ -9,8 +9,8 @@ use divff_exporters::manifest::{
 };
 use divff_exporters::npz::write_npz_matrices;
 use divff_exporters::{
-    AttributeValues, Geometry, GlbNode, GlbOptions, GlbScene, Manifest, NpzCompression, PlyOptions,
-    write_glb, write_npz, write_ply, write_scene_glb,
+    Attribute, AttributeValues, Geometry, GlbNode, GlbOptions, GlbScene, Manifest, NpzCompression,
+    PlyOptions, write_glb, write_npz, write_ply, write_scene_glb,
 };
 use serde::{Deserialize, Serialize};
 
@@ -34,6 +34,17 @@ impl Format {
     /// All, in the order in which they are written.
     pub const ALL: [Self; 3] = [Self::Ply, Self::Glb, Self::Npz];
 
+    /// Bytes of the arrays that its files of a map hold.
+    pub fn bytes(self, map: &SemanticMap) -> u64 {
+        let all = map.geometries.iter().map(geometry_bytes).sum::<u64>();
+        match self {
+            Self::Ply => all + geometry_bytes(&map.points),
+            // Each object, and all of them once more in the scene.
+            Self::Glb => 2 * all,
+            Self::Npz => geometry_bytes(&map.points),
+        }
+    }
+
     /// Extension of its files and name on the command line.
     pub fn name(self) -> &'static str {
         ["ply", "glb", "npz"][self as usize]
@@ -53,6 +64,17 @@ impl FromStr for Format {
         let found = Self::ALL.into_iter().find(|f| f.name() == text);
         found.ok_or_else(|| format!("`{text}` is no format of a map; give ply, glb or npz"))
     }
+}
+
+fn geometry_bytes(g: &Geometry) -> u64 {
+    let column = |a: &Attribute| match &a.values {
+        AttributeValues::U8(v) => v.len(),
+        wider => 4 * wider.len(),
+    };
+    let attributes = g.attributes.iter().map(column).sum::<usize>();
+    let features = g.features.iter().map(|f| 4 * f.values.len()).sum::<usize>();
+    let vectors = 12 * (g.positions.len() + g.normals.len() + g.triangles.len()) + 3 * g.colors.len();
+    (vectors + attributes + features) as u64
 }
 
 /// Writes the map into `folder` (made if need be) and returns the manifest, which is written last.

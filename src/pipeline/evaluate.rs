@@ -6,7 +6,7 @@ use std::time::Instant;
 use divff_exporters::Manifest;
 
 use super::folder::create_writable;
-use super::metrics::{RunMetrics, peak_rss_mb, skipped_in_training};
+use super::metrics::{RunMetrics, peak_rss_mb, saved_in_training, skipped_in_training};
 use super::semantics::SemanticEvaluation;
 use super::{Cost, Event, Observer, PipelineError, RunFolder};
 use crate::config::Config;
@@ -19,6 +19,7 @@ use crate::scene::{Frame, Scene, Split};
 use crate::semantics::SemanticFields;
 use crate::semantics::layers::FeatureLayers;
 use crate::train::Trained;
+use crate::work::Work;
 
 /// Layers of the files in `views/`.
 const VIEW_LAYERS: [Layer; 3] = [Layer::Rgb, Layer::Depth, Layer::Stream];
@@ -112,9 +113,21 @@ pub fn evaluate(
         }
     }
     cost.set_training(&trained.progress);
+    cost.saved.extend(saved_in_training(&trained.progress).map(|(what, work)| (what.to_owned(), work)));
+    cost.saved.insert("layers".to_owned(), unasked_layers(scene));
+    cost.saved.retain(|_, work| *work != Work::default());
+    skipped.insert("work".to_owned(), serde_json::json!(cost.saved));
     cost.eval_seconds = Some(start.elapsed().as_secs_f64());
     cost.peak_rss_mb = peak_rss_mb();
     Ok(Some(RunMetrics { quality, cost, compression, skipped }))
+}
+
+/// What the layers that [`VIEW_LAYERS`] leaves out would take of the test frames' views.
+fn unasked_layers(scene: &Scene) -> Work {
+    let unasked = Layer::ALL.into_iter().filter(|l| !VIEW_LAYERS.contains(l)).map(Layer::bytes_per_pixel);
+    let frames = scene.frames.iter().filter(|f| f.split == Split::Test);
+    let pixels = frames.map(|f| u64::from(f.camera.width) * u64::from(f.camera.height));
+    Work::bytes(unasked.sum::<u64>() * pixels.sum::<u64>())
 }
 
 /// What is measured of a frame: the colours as 8-bit PNGs hold them.

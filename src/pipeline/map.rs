@@ -13,6 +13,7 @@ use crate::scene::Scene;
 use crate::semantics::SemanticFields;
 use crate::semantics::bake::annotate;
 use crate::train::Trained;
+use crate::work::Work;
 
 /// Builds the map of a trained field, with the features and scores of `fields`, simplifies it if asked to, and writes it to `out`, with the times
 /// that it took into `cost`.
@@ -40,6 +41,11 @@ pub fn export_map(
         annotate(&mut map, scene, trained, fields, &config.semantics)?;
     }
     map::simplify(&mut map, &config.map, &mut |p| observer.event(&Event::Mapping(p)))?;
+    for (what, work) in &map.saved {
+        cost.save(what, *work);
+    }
+    let unasked = Format::ALL.into_iter().filter(|f| !formats.contains(f));
+    cost.save("formats", Work::bytes(unasked.map(|f| f.bytes(&map)).sum()));
     cost.extract_seconds = Some(start.elapsed().as_secs_f64());
     if observer.stop() {
         return Ok(None);

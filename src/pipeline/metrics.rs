@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::eval::Metrics;
 use crate::semantics::agreement::Compression;
 use crate::train::checkpoint::TrainingState;
+use crate::work::Work;
 
 /// Everything in `metrics.json`; what was not measured is left out.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -45,6 +46,9 @@ pub struct Cost {
     /// Seconds of rendering and comparing the test frames and the meshes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub eval_seconds: Option<f64>,
+    /// Work that the stages saved, by what saved it: `skipped.work` in the file.
+    #[serde(skip)]
+    pub saved: BTreeMap<String, Work>,
     /// Most memory that the program held at once, MB; unknown where the system does not tell.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub peak_rss_mb: Option<f64>,
@@ -59,7 +63,20 @@ pub struct Cost {
     pub rays_per_second: Option<f64>,
 }
 
+impl RunMetrics {
+    /// What the stages took and saved, for a stage that is done again.
+    pub fn known_cost(&self) -> Cost {
+        let saved = self.skipped.get("work").cloned().and_then(|work| serde_json::from_value(work).ok());
+        Cost { saved: saved.unwrap_or_default(), ..self.cost.clone() }
+    }
+}
+
 impl Cost {
+    /// Notes work that was saved.
+    pub fn save(&mut self, what: &str, work: Work) {
+        *self.saved.entry(what.to_owned()).or_default() += work;
+    }
+
     /// Fills in what training took.
     pub fn set_training(&mut self, state: &TrainingState) {
         let seconds = state.seconds.max(1e-9);
@@ -88,6 +105,17 @@ pub fn skipped_in_training(state: &TrainingState, streams: [bool; 3]) -> BTreeMa
         skipped.insert("pose_refinement".to_owned(), why.into());
     }
     skipped
+}
+
+/// The work that training saved: at points where the density grids say that a stream has nothing, for streams that the
+/// scene does not have, behind what lets no light through, and for poses that were exact already.
+pub fn saved_in_training(state: &TrainingState) -> [(&'static str, Work); 4] {
+    [
+        ("empty_space", Work::samples(state.candidates.saturating_sub(state.evaluations))),
+        ("absent_streams", Work::samples(state.absent)),
+        ("saturated_rays", Work::samples(state.spared)),
+        ("exact_poses", Work::samples(state.unrefined)),
+    ]
 }
 
 /// The metrics in a file, if there are any that can be read.

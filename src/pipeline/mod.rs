@@ -30,7 +30,8 @@ use crate::config::Config;
 use crate::map::Format;
 use crate::scene::Scene;
 use crate::semantics::head::train::HeadProgress;
-use crate::train::Progress;
+use crate::train::{Progress, Session};
+use crate::work::Work;
 
 /// Parts of a run, in order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -146,6 +147,9 @@ pub fn run(
     observer.event(&Event::Stage(Stage::Training));
     let session = train(scene, config, &run, options.fresh, observer)?;
     let progress = &session.trained().progress;
+    if let Session::Over(_) = &session {
+        cost.save("finished_training", Work::seconds(progress.seconds));
+    }
     let stopped = Outcome::Stopped { step: progress.step };
     if !progress.finished {
         return Ok(stopped);

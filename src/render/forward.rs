@@ -188,7 +188,8 @@ pub struct TracedRay {
 /// Buffers of one thread, used for one chunk after the other.
 #[derive(Default)]
 pub struct Tracer {
-    sampler: Sampler,
+    /// Places samples, and counts what that was spared.
+    pub sampler: Sampler,
     edges: Vec<f32>,
     /// What the networks of each stream left for the way back.
     pub activations: [StreamActivations; 3],

@@ -13,7 +13,7 @@ use crate::scene::Frame;
 const CHUNK_RAYS: usize = 32;
 
 /// A rendered frame; all layers are `[height * width]`.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderedFrame {
     /// Width, px.
     pub width: u32,

@@ -6,7 +6,7 @@ use super::rays::Ray;
 /// Most steps a ray takes through the density grids.
 const MAX_STEPS: usize = 768;
 
-/// A ray is cut off where less than this is left of its light.
+/// See [`Sampler`]: a share of the light that does not show.
 const SATURATED: f32 = 1e-4;
 
 /// Light that what moves leaves at least, as far as samples go: its grids hold for a span of time, in part of which it may
@@ -37,11 +37,23 @@ pub trait Steer {
 /// Buffers of one thread.
 pub struct Sampler {
     weights: Vec<f32>,
+    /// A ray is cut off where less than this is left of its light.
+    saturated: f32,
+    /// Steps through the grids that rays were spared because they had been cut off, so far.
+    pub spared: u64,
 }
 
 impl Default for Sampler {
     fn default() -> Self {
-        Self { weights: vec![0.0; MAX_STEPS] }
+        Self { weights: vec![0.0; MAX_STEPS], saturated: SATURATED, spared: 0 }
+    }
+}
+
+#[cfg(test)]
+impl Sampler {
+    /// One that goes on to the end of every ray.
+    pub fn without_cut() -> Self {
+        Self { saturated: 0.0, ..Self::default() }
     }
 }
 
@@ -91,14 +103,15 @@ impl Sampler {
                 left *= 1.0 - stands;
                 past *= 1.0 - moves;
                 used += 1;
-                if left < SATURATED {
+                if left < self.saturated {
                     break;
                 }
             }
-            if left < SATURATED {
+            if left < self.saturated {
                 break;
             }
         }
+        self.spared += (steps - used) as u64;
         let span = used as f32;
         let floor = sampling.explore * total.max(0.05) / ((1.0 - sampling.explore) * span);
         let total = total + floor * span;

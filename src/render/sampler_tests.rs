@@ -110,3 +110,40 @@ fn what_is_behind_something_that_moves_is_looked_at_all_the_same() {
     assert!(hand > SAMPLING.count / 3, "{hand} edges at what moves");
     assert!(wall >= SAMPLING.count / 8, "{wall} edges at what stands behind it");
 }
+
+#[test]
+fn nothing_that_shows_lies_behind_the_cut() {
+    let mut rng = Rng::new(3, 0, 0);
+    let mut cut_off = 0;
+    for case in 0..200 {
+        let sampling = Sampling { step: 0.004 + 0.02 * rng.uniform(), ..SAMPLING };
+        let (wall, density) = (0.2 + 1.5 * rng.uniform(), 300.0 * rng.uniform());
+        let sigma = |t: f32| if t > wall { density } else { 0.3 };
+        let (mut with, mut without) = (Sampler::default(), Sampler::without_cut());
+        let mut edges = [[0.0; SAMPLING.count + 1]; 2];
+        for (sampler, edges) in [&mut with, &mut without].into_iter().zip(&mut edges) {
+            assert!(sampler.edges(&ray(0.0, 2.0), &sampling, 0.5, &Along(sigma), edges));
+        }
+        assert_eq!(without.spared, 0, "case {case}");
+        let [cut, end] = edges.map(|e| e[SAMPLING.count]);
+        if with.spared == 0 {
+            assert_eq!(edges[0], edges[1], "case {case}: the same samples where nothing is cut off");
+            continue;
+        }
+        cut_off += 1;
+        let steps = (end - cut) / (2.0 / (2.0 / sampling.step).ceil());
+        assert!(
+            (steps - with.spared as f32).abs() < 0.1,
+            "case {case}: {steps} steps, {} spared",
+            with.spared
+        );
+        // All colours behind the cut together have this weight.
+        let depth = 0.3 * cut.min(wall) + density * (cut - wall).max(0.0);
+        assert!(
+            (-depth).exp() <= 1.01e-4,
+            "case {case}: {} of the light goes on behind the cut",
+            (-depth).exp()
+        );
+    }
+    assert!(cut_off > 50, "{cut_off} rays were cut off");
+}

@@ -28,6 +28,20 @@ pub enum Layer {
     Stream,
 }
 
+impl Layer {
+    /// All.
+    pub const ALL: [Self; 4] = [Self::Rgb, Self::Depth, Self::Normal, Self::Stream];
+
+    /// Bytes that it takes for a pixel.
+    pub fn bytes_per_pixel(self) -> u64 {
+        match self {
+            Self::Rgb => 8,
+            Self::Depth => 4,
+            Self::Normal | Self::Stream => 6,
+        }
+    }
+}
+
 /// Writes `<stem>.png` (8-bit sRGB, the exposure of the frame) if [`Layer::Rgb`] is among the layers, and `<stem>.exr`
 /// with all of them and with `extra` channels of the same size.
 ///
@@ -196,6 +210,28 @@ mod tests {
         assert_eq!(exr.channel("relevancy_cup.Y"), Some(&ExrSamples::F32(vec![0.25; 48])));
         let png = image::open(folder.path().join("000007.png")).unwrap().into_rgb8();
         assert_eq!(png.into_raw(), quantised(&picture().rgb));
+    }
+
+    #[test]
+    fn a_layer_is_the_same_whatever_else_is_asked_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |stem: &str, layers: &[Layer]| {
+            let c2w = DAffine3::IDENTITY;
+            write_view(folder.path(), stem, &picture(), &camera(), &c2w, layers, vec![]).unwrap();
+            read_exr(&folder.path().join(format!("{stem}.exr"))).unwrap().channels
+        };
+        let all = write("all", &Layer::ALL);
+        let size = |channel: &ExrChannel| match channel.samples {
+            ExrSamples::F16(_) => 2,
+            ExrSamples::F32(_) => 4,
+        };
+        for (n, layer) in Layer::ALL.into_iter().enumerate() {
+            let alone = write(&n.to_string(), &[layer]);
+            assert!(alone.iter().all(|channel| all.contains(channel)), "{layer:?}");
+            assert_eq!(alone.iter().map(size).sum::<u64>(), layer.bytes_per_pixel(), "{layer:?}");
+        }
+        let bytes = |stem: &str| std::fs::read(folder.path().join(format!("{stem}.png"))).unwrap();
+        assert_eq!(bytes("all"), bytes("0"));
     }
 
     #[test]

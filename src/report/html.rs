@@ -219,8 +219,8 @@ impl Page<'_> {
             for (what, value) in &self.metrics.skipped {
                 if let serde_json::Value::Object(reasons) = value {
                     for (item, why) in reasons {
-                        let why = why.as_str().unwrap_or_default();
-                        cells(out, &escaped(&format!("{what}: {item}")), &[escaped(why)]);
+                        let item = format!("{what}: {}", item.replace('_', " "));
+                        cells(out, &escaped(&item), &[escaped(&reason(why))]);
                     }
                     continue;
                 }
@@ -297,6 +297,18 @@ fn size(bytes: u64) -> String {
 
 pub(crate) fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// Why something was skipped, or what work that saved: `5000 samples, 12 bytes`.
+fn reason(why: &serde_json::Value) -> String {
+    let amount = |(unit, n): (&String, &serde_json::Value)| match n.as_u64() {
+        Some(n) => format!("{n} {unit}"),
+        None => format!("{:.1} {unit}", n.as_f64().unwrap_or_default()),
+    };
+    match why {
+        serde_json::Value::Object(work) => work.iter().map(amount).collect::<Vec<_>>().join(", "),
+        other => other.as_str().unwrap_or_default().to_owned(),
+    }
 }
 
 #[cfg(test)]

@@ -4,6 +4,9 @@
 //! where the cameras look. Percentiles keep a few wrong points or poses from blowing the box up.
 
 use glam::{DMat3, DVec2, DVec3};
+use kdtree::KdTree;
+use kdtree::distance::squared_euclidean;
+use rayon::prelude::*;
 
 use super::draft::Draft;
 use super::error::{Place, SceneError};
@@ -13,6 +16,12 @@ use super::{Aabb, Frame};
 const ENOUGH_POINTS: usize = 50;
 /// Share of the points or cameras that is cut off at either end of an axis.
 const TRIM: f64 = 0.01;
+/// A point is a stray if its neighbour of this rank is farther away than so many times the median of those distances.
+/// Walls have far fewer points than what lies on a table: a smaller factor would take them for strays.
+const NEIGHBOUR: usize = 8;
+const STRAY: f64 = 20.0;
+/// Points that are looked at for that, at most: evenly through the list.
+const LOOKED_AT: usize = 50_000;
 /// Widening of a box found from data, as a share of its size, on every side.
 const MARGIN: f64 = 0.05;
 
@@ -71,9 +80,32 @@ pub(crate) fn find(draft: &Draft, frames: &[Frame], warnings: &mut Vec<String>) 
 
 /// Box around the sparse points and the cameras.
 fn from_points(points: &[DVec3], frames: &[Frame]) -> Aabb {
-    let of_points = trimmed_box(points.to_vec());
+    let of_points = trimmed_box(without_strays(points));
     let of_cameras = trimmed_box(frames.iter().map(|f| f.c2w.translation).collect());
     widened(Aabb { min: of_points.min.min(of_cameras.min), max: of_points.max.max(of_cameras.max) })
+}
+
+/// The points that have neighbours (statistical outlier removal, Rusu et al. 2008, with a median): wrong matches of
+/// structure from motion lie alone and far away, and more than a percentile cuts off may be wrong.
+fn without_strays(points: &[DVec3]) -> Vec<DVec3> {
+    let every = points.len().div_ceil(LOOKED_AT).max(1);
+    let points: Vec<DVec3> = points.iter().step_by(every).copied().filter(|p| p.is_finite()).collect();
+    let mut tree = KdTree::with_capacity(3, 16);
+    for p in &points {
+        // Only numbers that are not finite are refused.
+        let _ = tree.add(p.to_array(), ());
+    }
+    let distance = |p: &DVec3| {
+        let near = tree.nearest(&p.to_array(), NEIGHBOUR + 1, &squared_euclidean).unwrap_or_default();
+        near.last().map_or(0.0, |(squared, ())| squared.sqrt())
+    };
+    let distances: Vec<f64> = points.par_iter().map(distance).collect();
+    let mut sorted = distances.clone();
+    sorted.sort_by(f64::total_cmp);
+    let limit = sorted.get(sorted.len() / 2).map_or(0.0, |median| STRAY * median);
+    // More than half of the points in one place say nothing about the others.
+    let kept = points.iter().zip(distances).filter(|(_, d)| limit == 0.0 || *d <= limit);
+    kept.map(|(p, _)| *p).collect()
 }
 
 /// Box around the cameras and what they can see up to the distance where things probably are.
@@ -201,4 +233,44 @@ fn ray_hits(origin: DVec3, dir: DVec3, bounds: &Aabb) -> bool {
         far = far.min(a.max(b));
     }
     near <= far
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::Rng;
+
+    /// Points on the sides of a unit cube, as dense on one of them as on all others together.
+    fn room(rng: &mut Rng) -> Vec<DVec3> {
+        let mut point = |n: usize| {
+            let mut p = [0.0; 3].map(|_: f64| f64::from(rng.uniform()));
+            let side = if n.is_multiple_of(2) { 0 } else { 1 + n / 2 % 5 };
+            p[side % 3] = (side / 3) as f64;
+            DVec3::from_array(p)
+        };
+        (0..4000).map(&mut point).collect()
+    }
+
+    #[test]
+    fn strays_are_dropped_and_sparse_walls_are_kept() {
+        let mut rng = Rng::new(5, 0, 0);
+        let mut points = room(&mut rng);
+        assert_eq!(without_strays(&points).len(), points.len());
+        // A twentieth of all: more than a percentile would cut off.
+        for _ in 0..200 {
+            points.push(DVec3::from_array([0.0; 3].map(|_: f64| 400.0 * f64::from(rng.uniform()) - 200.0)));
+        }
+        points.push(DVec3::NAN);
+        let b = trimmed_box(without_strays(&points));
+        assert!(b.min.cmpge(DVec3::splat(-1.0)).all() && b.max.cmple(DVec3::splat(2.0)).all(), "{b:?}");
+        assert!((b.max - b.min).min_element() > 0.9, "{b:?}");
+    }
+
+    #[test]
+    fn points_in_one_place_are_no_reason_to_drop_the_others() {
+        let mut points = vec![DVec3::ONE; 500];
+        points.extend((0..100).map(|n| DVec3::splat(f64::from(n))));
+        assert_eq!(without_strays(&points).len(), 600);
+        assert!(without_strays(&[]).is_empty());
+    }
 }

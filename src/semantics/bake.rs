@@ -19,6 +19,7 @@ use crate::render::refined::refined_camera;
 use crate::scene::features::Space;
 use crate::scene::{Frame, Scene};
 use crate::train::Trained;
+use crate::work::Work;
 
 /// Phrases of a space that get a column each; a long list of embeddings is there to be asked, not to be stored.
 const MOST_PHRASES: usize = 24;
@@ -59,6 +60,9 @@ pub fn annotate(
             let why = fields.skipped.iter().find(|s| s.0 == space.name());
             let why = why.map_or("it was not trained", |s| &s.1).to_owned();
             map.skipped.push(Skipped { what: format!("{} features", space.name()), why });
+            let vertices = map.geometries.iter().chain([&map.points]).map(|g| g.positions.len());
+            let samples = vertices.sum::<usize>() as u64;
+            *map.saved.entry("feature_spaces").or_default() += Work::samples(samples);
             continue;
         };
         let columns = Columns::new(map, field, &text, config)?;

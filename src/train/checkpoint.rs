@@ -47,6 +47,15 @@ pub struct TrainingState {
     pub evaluations: u64,
     /// Evaluations there would have been at every placed sample for every stream.
     pub candidates: u64,
+    /// Evaluations there would have been for the streams that the scene does not have.
+    #[serde(default)]
+    pub absent: u64,
+    /// Steps through the density grids that rays were spared where nothing was left of their light.
+    #[serde(default)]
+    pub spared: u64,
+    /// Evaluations from which poses would have learned if they had not been exact.
+    #[serde(default)]
+    pub unrefined: u64,
     /// Rays traced.
     pub rays: u64,
     /// Whether the streams of the scene have been settled.

@@ -98,6 +98,12 @@ pub struct StepReport {
     pub evaluations: usize,
     /// Samples placed, times streams: what would have been evaluated without occupancy.
     pub candidates: usize,
+    /// Samples placed, times streams that the field does not have.
+    pub absent: usize,
+    /// Steps through the density grids that rays were spared because nothing was left of their light.
+    pub spared: u64,
+    /// Evaluations from which no pose was to learn, of those from which one would have.
+    pub unrefined: usize,
     /// Number of the first chunk of rays whose loss is not finite.
     pub diverged: Option<usize>,
 }
@@ -168,10 +174,15 @@ impl Optimiser {
             report.loss += g.loss.total / rays as f64;
             report.squared += g.loss.squared / rays as f64;
             report.evaluations += g.evaluations;
+            report.spared += g.spared;
             report.diverged = report.diverged.or(g.diverged);
         }
         let live = plan.streams.iter().filter(|s| **s).count();
         report.candidates = rays * plan.sampling.count * live;
+        report.absent = rays * plan.sampling.count * field.nets.iter().filter(|net| net.is_none()).count();
+        if plan.pose_rate == 0.0 && plan.rig_rate == 0.0 {
+            report.unrefined = report.evaluations / group::REFINE_EVERY as usize;
+        }
         update(self, field, grids, &views, plan);
         report
     }

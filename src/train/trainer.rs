@@ -22,6 +22,8 @@ use crate::scene::features::FeatureStore;
 use crate::scene::{Frame, Scene, Split};
 
 #[cfg(test)]
+mod skip_tests;
+#[cfg(test)]
 mod tests;
 
 /// Steps between two reports.
@@ -274,6 +276,11 @@ impl Trainer {
         progress.rays += report.rays as u64;
         progress.evaluations += report.evaluations as u64;
         progress.candidates += report.candidates as u64;
+        progress.absent += report.absent as u64;
+        progress.spared += report.spared;
+        if progress.trusts_poses {
+            progress.unrefined += report.unrefined as u64;
+        }
     }
 
     /// Takes one step as at the share `fraction` of the schedule, with the loss of a companion where there is one.

@@ -7,3 +7,4 @@ mod commands;
 mod features;
 mod kit;
 mod resuming;
+mod skipping;

@@ -8,12 +8,13 @@ use glam::Vec3;
 use crate::SIZES;
 use crate::rng::Rng;
 
-/// A density at each of some stretches of the ray.
+/// A density at each of some stretches of the ray, and of what moves the same the other way round.
 struct Stretches(Vec<f32>);
 
 impl Steer for Stretches {
-    fn sigma(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
-        t.map(|t| self.0[(t * self.0.len() as f32) as usize % self.0.len()])
+    fn sigma(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
+        let stretch = |t: f32| (t * self.0.len() as f32) as usize % self.0.len();
+        [t.map(|t| self.0[stretch(t)]), t.map(|t| self.0[self.0.len() - 1 - stretch(t)])]
     }
 }
 

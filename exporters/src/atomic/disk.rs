@@ -1,6 +1,6 @@
 //! What an atomic write asks of the file system: the one place where tests make it fail.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
@@ -21,10 +21,17 @@ pub struct TempFile {
 }
 
 impl TempFile {
-    /// Creates `path`, which must not exist.
+    /// Creates `path`, which must not exist, and locks it as long as it is open.
+    ///
+    /// # Errors
+    /// `AlreadyExists` also where somebody who clears up was faster than the lock.
     pub(super) fn create(path: &Path, target: &Path) -> io::Result<Self> {
         check(target)?;
         let file = OpenOptions::new().write(true).create_new(true).open(path)?;
+        // Not every file system has locks; where there are none, nobody clears up.
+        if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) || !path.exists() {
+            return Err(io::ErrorKind::AlreadyExists.into());
+        }
         Ok(Self { file, target: target.to_owned() })
     }
 

@@ -46,6 +46,29 @@ fn a_view_survives_bit_for_bit_and_by_name() {
 }
 
 #[test]
+fn other_compressions_lose_nothing_but_the_last_digits_of_pxr24() {
+    let (_folder, path) = temp_file();
+    let view = view();
+    for compression in [ExrCompression::None, ExrCompression::Zip, ExrCompression::Piz, ExrCompression::Pxr24]
+    {
+        write_exr_with(&path, view.clone(), compression).unwrap();
+        let read = read_exr(&path).unwrap();
+        for channel in &view.channels {
+            let found = read.channel(&channel.name).unwrap();
+            match (found, &channel.samples) {
+                (ExrSamples::F32(found), ExrSamples::F32(samples))
+                    if compression == ExrCompression::Pxr24 =>
+                {
+                    let close = |(a, b): (&f32, &f32)| (a - b).abs() <= b.abs() * 2f32.powi(-15);
+                    assert!(found.iter().zip(samples).all(close));
+                }
+                (found, samples) => assert_eq!(found, samples, "{compression:?} {}", channel.name),
+            }
+        }
+    }
+}
+
+#[test]
 fn a_file_is_one_unnamed_part_of_zip_scan_lines_in_increasing_order() {
     let (_folder, path) = temp_file();
     write_exr(&path, view()).unwrap();

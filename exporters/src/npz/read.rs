@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
+use half::f16;
 use serde_json::Value;
 use zip::ZipArchive;
 use zip::result::ZipError;
@@ -128,9 +129,9 @@ pub(super) fn parse_array<'a>(path: &Path, name: &str, file: &'a [u8]) -> Result
     let unsupported = |what: String| Error::Unsupported {
         path: path.to_owned(),
         what: format!("array `{name}`: {what}"),
-        remedy: "save C-ordered <f4, <i4 or |u1 arrays of one or two dimensions",
+        remedy: "save C-ordered <f4, <f2, <i4 or |u1 arrays of one or two dimensions",
     };
-    if !matches!(header.dtype, Dtype::F32 | Dtype::I32 | Dtype::U8) {
+    if !matches!(header.dtype, Dtype::F16 | Dtype::F32 | Dtype::I32 | Dtype::U8) {
         return Err(unsupported(format!("its type {}", header.dtype.descr())));
     }
     let columns = match header.shape[..] {
@@ -163,10 +164,12 @@ fn insert(path: &Path, geometry: &mut Geometry, name: String, array: &Array) -> 
         ("positions" | "normals", ..) => return wrong("3 of <f4"),
         ("colors", ..) => return wrong("3 of |u1"),
         ("triangles", ..) => return wrong("3 of <i4"),
-        (_, Dtype::F32, 1) => push(geometry, name, AttributeValues::F32(floats(array))),
+        (_, Dtype::F16 | Dtype::F32, 1) => push(geometry, name, AttributeValues::F32(floats(array))),
         (_, Dtype::I32, 1) => push(geometry, name, AttributeValues::I32(integers(array))),
         (_, Dtype::U8, 1) => push(geometry, name, AttributeValues::U8(array.bytes.to_vec())),
-        (_, Dtype::F32, dim) => geometry.features.push(Features { name, dim, values: floats(array) }),
+        (_, Dtype::F16 | Dtype::F32, dim) => {
+            geometry.features.push(Features { name, dim, values: floats(array) })
+        }
         _ => return wrong("1, or any number of <f4"),
     }
     Ok(())
@@ -177,6 +180,9 @@ fn push(geometry: &mut Geometry, name: String, values: AttributeValues) {
 }
 
 fn floats(array: &Array) -> Vec<f32> {
+    if array.dtype == Dtype::F16 {
+        return array.bytes.as_chunks().0.iter().map(|b| f16::from_le_bytes(*b).to_f32()).collect();
+    }
     array.bytes.as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect()
 }
 

@@ -3,11 +3,13 @@
 use std::fs;
 use std::path::PathBuf;
 
+use half::f16;
 use proptest::prelude::*;
 
 use super::read::parse_array;
 use super::*;
 use crate::error::Error;
+use crate::geometry::Features;
 use crate::samples::*;
 
 fn temp_file() -> (tempfile::TempDir, PathBuf) {
@@ -29,6 +31,26 @@ proptest! {
         prop_assert_eq!(bits(&read), bits(&geometry));
         prop_assert_eq!(read, geometry);
     }
+}
+
+#[test]
+fn halves_of_features_come_back_rounded_and_everything_else_exact() {
+    let (_folder, path) = temp_file();
+    let mut geometry = tetrahedron();
+    let values = vec![0.1, -1.0, 3e-5, 65504.0, 0.5, 1e-9, 2.0, 1.0 / 3.0];
+    geometry.features = vec![Features { name: "clip".into(), dim: 2, values }];
+    write_npz(&path, &geometry, NpzCompression::HalfFeatures).unwrap();
+    let mut read = read_npz(&path).unwrap();
+    let found = std::mem::take(&mut read.features[0].values);
+    let expected: Vec<f32> = geometry.features[0].values.iter().map(|v| f16::from_f32(*v).to_f32()).collect();
+    assert_eq!(found, expected);
+    assert_ne!(found, geometry.features[0].values);
+    geometry.features[0].values.clear();
+    assert_eq!(read, geometry);
+
+    geometry.features[0].values = vec![0.0, 0.0, 0.0, 1e5, 0.0, 0.0, 0.0, 0.0];
+    let error = write_npz(&path, &geometry, NpzCompression::HalfFeatures).unwrap_err();
+    assert!(matches!(&error, Error::NonFinite { row: 1, .. }), "{error}");
 }
 
 #[test]
@@ -72,7 +94,7 @@ fn npy_headers_that_lie_or_are_not_ours_are_errors() {
     assert_eq!(parse(&dictionary("'<f4'", "False", "(2, 3)"), 24).unwrap(), (3, 24));
     assert_eq!(parse(&dictionary("'|u1'", "False", "(5,)"), 5).unwrap(), (1, 5));
     for (descr, order, shape) in
-        [("'<f2'", "False", "(2, 3)"), ("'<f4'", "True", "(2, 3)"), ("'<f4'", "False", "(2, 3, 1)")]
+        [("'<f8'", "False", "(2, 3)"), ("'<f4'", "True", "(2, 3)"), ("'<f4'", "False", "(2, 3, 1)")]
     {
         let error = parse(&dictionary(descr, order, shape), 24).unwrap_err();
         assert!(matches!(error, Error::Unsupported { .. }), "{error}");

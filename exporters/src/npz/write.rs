@@ -3,6 +3,7 @@
 use std::io::{self, Seek, SeekFrom, Write};
 use std::path::Path;
 
+use half::f16;
 use serde_json::json;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
@@ -10,7 +11,8 @@ use crate::atomic::{AtomicWriter, write_atomically};
 use crate::error::{Error, Result};
 use crate::geometry::{AttributeValues, Geometry};
 use crate::npy::{self, Dtype};
-use crate::rows::write_words;
+use crate::rows::{write_items, write_words};
+use crate::validate::position_of_first;
 
 /// How the arrays are stored.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -20,6 +22,8 @@ pub enum NpzCompression {
     Stored,
     /// Deflated, like `numpy.savez_compressed`.
     Deflated,
+    /// As they are, but feature matrices in half precision; Open3D does not read those.
+    HalfFeatures,
 }
 
 /// From here on sizes need zip64 fields, which Open3D's reader does not know.
@@ -31,6 +35,9 @@ const ZIP64_FROM: u64 = u32::MAX as u64;
 /// `Inconsistent` or `NonFinite` when the geometry breaks its invariants; `Io`.
 pub fn write_npz(path: &Path, geometry: &Geometry, compression: NpzCompression) -> Result<()> {
     geometry.validate()?;
+    if compression == NpzCompression::HalfFeatures {
+        check_half(geometry)?;
+    }
     write_atomically(path, |file| {
         write_archive(file, compression, |archive| {
             let note = json!({ "name": geometry.name, "offset": geometry.offset });
@@ -38,6 +45,23 @@ pub fn write_npz(path: &Path, geometry: &Geometry, compression: NpzCompression) 
             archive.geometry(geometry)
         })
     })
+}
+
+/// # Errors
+/// `NonFinite` for a feature that half precision would make infinite.
+fn check_half(geometry: &Geometry) -> Result<()> {
+    for features in &geometry.features {
+        let too_large = |v: &f32| f16::from_f32(*v).is_infinite();
+        if let Some(index) = position_of_first(&features.values, too_large) {
+            return Err(Error::NonFinite {
+                object: geometry.name.clone(),
+                column: features.name.clone(),
+                row: index / features.dim,
+                value: f64::from(f16::from_f32(features.values[index])),
+            });
+        }
+    }
+    Ok(())
 }
 
 /// Writes matrices that belong to no vertices: name, columns and row-major values of each.
@@ -147,7 +171,12 @@ impl Archive<'_, '_> {
             }
         }
         for features in &geometry.features {
-            self.floats(&features.name, features.dim, &features.values)?;
+            match self.compression {
+                NpzCompression::HalfFeatures => {
+                    self.halves(&features.name, features.dim, &features.values)?
+                }
+                _ => self.floats(&features.name, features.dim, &features.values)?,
+            }
         }
         if !geometry.triangles.is_empty() {
             // Signed, as Open3D wants it; validate() keeps indices below the vertex count.
@@ -158,6 +187,11 @@ impl Archive<'_, '_> {
 
     fn floats(&mut self, name: &str, columns: usize, values: &[f32]) -> io::Result<()> {
         self.words(name, Dtype::F32, columns, bytemuck::cast_slice(values))
+    }
+
+    fn halves(&mut self, name: &str, columns: usize, values: &[f32]) -> io::Result<()> {
+        self.start(name, Dtype::F16, columns, values.len())?;
+        write_items(&mut self.zip, values, |v| f16::from_f32(*v).to_le_bytes())
     }
 
     /// `values` is row-major `[rows, columns]`, of a type of four bytes.
@@ -176,7 +210,7 @@ impl Archive<'_, '_> {
         let header = npy::header_bytes(dtype, &[values / columns, columns]);
         let total = (header.len() + values * dtype.size()) as u64;
         let method = match self.compression {
-            NpzCompression::Stored => zip::CompressionMethod::Stored,
+            NpzCompression::Stored | NpzCompression::HalfFeatures => zip::CompressionMethod::Stored,
             NpzCompression::Deflated => zip::CompressionMethod::Deflated,
         };
         // The default time stamp is fixed (1980), so that the same input gives the same bytes.

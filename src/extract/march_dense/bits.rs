@@ -73,11 +73,11 @@ impl WithSimd for ClassifyLayer<'_> {
 }
 
 /// Numbers that are looked at together; any vector's width divides it.
-const LANES: usize = 16;
+pub(crate) const LANES: usize = 16;
 
 /// Bit x = value x is above `iso`. Sets the highest bit of one of `exponents` for a value that is not finite.
 #[inline(always)]
-fn inside_word(values: &[f32; 64], iso: f32, exponents: &mut [u32; LANES]) -> u64 {
+pub(crate) fn inside_word(values: &[f32; 64], iso: f32, exponents: &mut [u32; LANES]) -> u64 {
     // Each lane collects its own bits of a half; or-ing the lanes puts them together.
     let mut halves = [[0u32; LANES]; 2];
     for (half, values) in halves.iter_mut().zip(values.as_chunks::<32>().0) {

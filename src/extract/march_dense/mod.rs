@@ -5,7 +5,7 @@
 //! the layers, each in parallel: bits; counts, whose running sums say where every row's vertices and every
 //! layer's triangles go; and the output, which is written once, where it stays.
 
-mod bits;
+pub(super) mod bits;
 mod cells;
 mod rows;
 
@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use self::bits::Inside;
 use self::rows::{Layout, WriteLayer};
-use super::march::check_vertex_count;
+use super::march::{check_vertex_count, split};
 use super::{ExtractError, TriMesh};
 
 /// Extracts the surface `value = iso` (greater is inside) of a dense grid, in units of a cell.
@@ -46,10 +46,4 @@ pub fn march_dense(values: &[f32], dims: [usize; 3], iso: f32) -> Result<TriMesh
         arch.dispatch(WriteLayer { values, iso, inside: &inside, layout: &layout, z, positions, triangles });
     });
     Ok(mesh)
-}
-
-/// Splits an array into parts of these lengths.
-fn split<T>(mut rest: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
-    let next = |length| rest.split_off_mut(..length).unwrap_or_default();
-    lengths.map(next).collect()
 }

@@ -14,6 +14,9 @@ use crate::train::loss::flatness::{self, Bend};
 use crate::train::loss::{self, Aims, ChunkGradient, ChunkLoss, LossConfig, RayTarget};
 use crate::train::pixels::PixelSet;
 
+/// Poses change slowly and their gradient costs time: one of so many chunks of rays is enough.
+pub const REFINE_EVERY: u64 = 4;
+
 /// Random cells of each density grid that a group looks at in a step.
 const REFRESH_CELLS: usize = 2 * TILE;
 
@@ -60,6 +63,8 @@ pub struct Group {
     /// Number of the first chunk whose loss is not finite.
     pub diverged: Option<usize>,
     pub evaluations: usize,
+    /// Steps through the density grids that its rays were spared.
+    pub spared: u64,
 }
 
 impl Group {
@@ -68,10 +73,12 @@ impl Group {
     pub fn place(&mut self, context: &Context, first: usize, chunks: usize) {
         self.chunks.resize_with(chunks, TrainChunk::default);
         self.first = first;
+        self.tracer.sampler.spared = 0;
         for (n, chunk) in self.chunks.iter_mut().enumerate() {
             chunk.choose_rays(context, first + n);
             chunk.place(context, &mut self.tracer, first + n);
         }
+        self.spared = self.tracer.sampler.spared;
         let mut rng = Rng::new(context.seed, context.plan.step, u64::MAX - first as u64);
         for (s, refresh) in self.refresh.iter_mut().enumerate() {
             refresh.place(context, s, &mut rng);
@@ -87,7 +94,7 @@ impl Group {
     /// Evaluates the encoded samples and goes all the way back to their encodings.
     #[inline(always)]
     pub fn evaluate<S: Simd>(&mut self, simd: S, context: &Context) {
-        let Self { chunks, first, refresh, tracer, gradient, dense, loss, diverged, evaluations } = self;
+        let Self { chunks, first, refresh, tracer, gradient, dense, loss, diverged, evaluations, .. } = self;
         dense.clear();
         dense.resize(context.model.field.layout.len, 0.0);
         (*loss, *diverged, *evaluations) = (ChunkLoss::default(), None, 0);
@@ -196,9 +203,8 @@ impl TrainChunk {
     pub fn place(&mut self, context: &Context, tracer: &mut Tracer, number: usize) {
         let plan = context.plan;
         self.traced.place(tracer, context.model, context.views, &self.inputs, &plan.sampling);
-        // Poses change slowly and their gradient costs time: a quarter of the chunks is enough.
         let refine = plan.pose_rate > 0.0 || plan.rig_rate > 0.0;
-        let slopes = refine && (number as u64 + plan.step).is_multiple_of(4);
+        let slopes = refine && (number as u64 + plan.step).is_multiple_of(REFINE_EVERY);
         // The actor's coordinates are the camera's: they do not depend on its pose.
         for (batch, slopes) in self.traced.batches.iter_mut().zip([slopes, slopes, false]) {
             batch.slopes = slopes;

@@ -1,0 +1,99 @@
+//! What is skipped changes nothing that shows: trainings and pictures with and without.
+
+use super::*;
+use crate::render::image::RenderedFrame;
+use crate::train::testing;
+
+/// A field that learned the wall, with cells in which a stream is skipped.
+fn trained(folder: &Path) -> (Scene, Trainer) {
+    let scene = testing::scene(folder);
+    let mut config = testing::config();
+    config.train.steps = 200;
+    config.train.streams = StreamChoice::All;
+    config.train.static_until = 0.2;
+    config.train.stereo_at = 1.0;
+    config.train.skip_from = 0.3;
+    let mut trainer = Trainer::new(&scene, &config).expect("the test's scene is valid");
+    let run = tempfile::tempdir().expect("a temporary folder");
+    trainer.run(run.path(), None, &mut |_| ControlFlow::Continue(())).expect("training goes through");
+    (scene, trainer)
+}
+
+fn picture(field: &Field, grids: &Grids, streams: [bool; 3], frame: &Frame) -> RenderedFrame {
+    let sampling = Sampling { count: 32, step: 0.01, explore: 0.2, sharpness: 1.0 };
+    render(&Model::new(field, grids, streams), frame, &sampling, 1)
+}
+
+#[test]
+fn a_stream_that_is_nowhere_and_one_that_is_absent_look_the_same() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (scene, trainer) = trained(folder.path());
+    let mut trained = trainer.into_trained();
+    for grid in &mut trained.grids.streams[1..] {
+        grid.sigma.fill(0.0);
+    }
+    let draw = |trained: &Trained, streams| -> Vec<RenderedFrame> {
+        scene.frames.iter().map(|f| picture(&trained.field, &trained.grids, streams, f)).collect()
+    };
+    let all = draw(&trained, [true; 3]);
+    assert_eq!(draw(&trained, [true, false, false]), all, "streams that are not asked for");
+    trained.keep_streams([true, false, false]);
+    assert_eq!(draw(&trained, [true; 3]), all, "streams that the field does not have");
+    assert!(all.iter().flat_map(|i| &i.opacity).any(|o| o[0] > 0.5), "there is something to see");
+}
+
+#[test]
+fn a_training_without_the_moving_streams_counts_what_they_would_have_taken() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    let mut config = testing::config();
+    config.train.streams = StreamChoice::Static;
+    let mut trainer = Trainer::new(&scene, &config).expect("the test's scene is valid");
+    let report = trainer.step(0.5, None).expect("the numbers stay finite");
+    assert_eq!(report.absent, 2 * report.rays * trainer.config.train.samples);
+    assert_eq!(report.candidates * 2, report.absent);
+}
+
+#[test]
+fn skipped_cells_do_not_show() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (scene, trainer) = trained(folder.path());
+    let Trained { field, grids, progress } = trainer.trained();
+    assert!(progress.evaluations < progress.candidates, "{progress:?}");
+    let everywhere = Grids { threshold: [0.0; 3], ..grids.clone() };
+    let (mut squared, mut count) = (0.0, 0);
+    for frame in &scene.frames {
+        let [with, without] = [grids, &everywhere].map(|grids| picture(field, grids, [true; 3], frame));
+        for (a, b) in with.rgb.as_flattened().iter().zip(without.rgb.as_flattened()) {
+            squared += f64::from(a - b).powi(2);
+            count += 1;
+        }
+    }
+    let same = psnr(squared / f64::from(count));
+    assert!(same > 40.0, "pictures with and without agree to {same} dB");
+}
+
+#[test]
+fn poses_that_are_exact_cost_nothing_and_change_nothing_else() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    let step = |trusts: bool| {
+        let mut config = testing::config();
+        // Refined, but not so far that a float of a camera moves.
+        (config.train.pose_rate, config.train.rig_rate) = (1e-20, 0.0);
+        let mut trainer = Trainer::new(&scene, &config).expect("the test's scene is valid");
+        trainer.trained.progress.trusts_poses = trusts;
+        for _ in 0..6 {
+            let report = trainer.step(0.5, None).expect("the numbers stay finite");
+            assert_eq!(report.unrefined > 0, trusts);
+            trainer.count(&report);
+        }
+        assert_eq!(trainer.trained.progress.unrefined > 0, trusts);
+        let field = &mut trainer.trained.field;
+        let refinement = field.layout.refinement();
+        assert_eq!(field.weights[refinement.clone()].iter().all(|w| *w == 0.0), trusts);
+        field.weights[refinement].fill(0.0);
+        (field.weights.clone(), field.tables.clone())
+    };
+    assert!(step(true) == step(false), "the way back to the poses changed the field");
+}
