@@ -207,10 +207,10 @@ struct Wall(DensityGrid);
 
 impl Steer for Wall {
     #[inline(always)]
-    fn sigma(&self, points: &[[f32; STRIDE]; 3], _: &[f32; STRIDE]) -> [f32; STRIDE] {
+    fn sigma(&self, points: &[[f32; STRIDE]; 3], _: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
         let mut out = [0.0; STRIDE];
         self.0.add_at(points, 0, &mut out);
-        out
+        [out, [0.0; STRIDE]]
     }
 }
 
