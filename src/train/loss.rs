@@ -55,9 +55,9 @@ impl Default for LossConfig {
         Self {
             beta_min: 0.03,
             transient: 0.01,
-            transient_opacity: [8.0, 1.0],
+            transient_opacity: [8.0, 1.2],
             moving: 20.0,
-            veil: 6.0,
+            veil: 5.5,
             distortion: 0.3,
             entropy: 0.0,
             depth: 4.0,

@@ -173,3 +173,18 @@ fn trusted_poses_are_not_refined() {
         assert_eq!(refinement.iter().all(|w| *w == 0.0), trusts);
     }
 }
+
+/// Otherwise what moves is let in, and empty space skipped, before anything is known.
+#[test]
+fn a_schedule_by_the_clock_begins_with_the_first_step() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut trainer = Trainer::new(&testing::scene(folder.path()), &config(0.3)).expect("the scene is valid");
+    let budget = Some(Duration::from_secs(60));
+    // Looking for depth took a third of the time.
+    (trainer.trained.progress.prepared, trainer.trained.progress.seconds) = (20.0, 20.0);
+    assert_eq!(trainer.fraction(budget), 0.0);
+    trainer.trained.progress.seconds = 40.0;
+    assert_eq!(trainer.fraction(budget), 0.5);
+    trainer.trained.progress.seconds = 61.0;
+    assert_eq!(trainer.fraction(budget), 1.0);
+}
