@@ -28,7 +28,7 @@ fn metrics_say_what_was_saved() {
     ] {
         assert!(work[what][unit].as_u64().is_some_and(|n| n > 0), "{what} {unit}: {work}");
     }
-    // Nothing becomes so dense in a hundred steps that a ray is cut off, and what saved nothing is not listed.
+    // Nothing becomes so dense in so few steps that a ray is cut off, and what saved nothing is not listed.
     assert_eq!(work.get("saturated_rays"), None, "{work}");
     assert_eq!(work.get("formats"), None, "a run writes all formats: {work}");
     assert_eq!(work.get("finished_training"), None, "it was trained here: {work}");
