@@ -79,7 +79,7 @@ pub struct TrainConfig {
 impl Default for TrainConfig {
     fn default() -> Self {
         Self {
-            steps: 4000,
+            steps: 4200,
             rays: 4096,
             patch: 4,
             samples: 20,
