@@ -37,7 +37,7 @@ pub trait Steer {
 /// Buffers of one thread.
 pub struct Sampler {
     weights: Vec<f32>,
-    /// A ray is cut off where less than this is left of its light.
+    /// A ray is cut off where what stands leaves less than this of its light.
     saturated: f32,
     /// Steps through the grids that rays were spared because they had been cut off, so far.
     pub spared: u64,

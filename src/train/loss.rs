@@ -14,7 +14,7 @@ pub mod flatness;
 pub(super) const STEREO_ERROR: f32 = 0.01;
 
 /// How much more a pixel that the actor explains costs where things are that move: a hand may hold what it hides.
-const WHERE_THINGS_MOVE: f32 = 2.5;
+pub const WHERE_THINGS_MOVE: f32 = 2.5;
 
 /// Share of the schedule from which veils cost something.
 const VEIL_FROM: f32 = 0.3;
@@ -30,7 +30,8 @@ pub struct LossConfig {
     pub beta_min: f32,
     /// λ_u: price of dynamic and actor density (mean σ·δ over a ray).
     pub transient: f32,
-    /// Price of a pixel that is explained by the dynamic or the actor stream, in nats: the prior odds against it.
+    /// Price of a pixel that is explained by the dynamic or the actor stream, in nats: the prior odds against it. Where things
+    /// are that move the first is 0 and the second [`WHERE_THINGS_MOVE`] times as high.
     pub transient_opacity: [f32; 2],
     /// Price of persistent light where things are that move, though they may be at rest, in nats; dynamic light is free
     /// there. 0: what moves is not looked for.
