@@ -6,6 +6,9 @@ pub(super) const WORST: f32 = 1.0;
 /// Cost 1 in stored steps.
 const SCALE: f32 = 200.0;
 
+/// Pixels that are transposed together.
+const BLOCK: usize = 64;
+
 /// Price of going to a neighbouring plane from one pixel to the next.
 const SMALL_STEP: u16 = 10;
 
@@ -30,15 +33,19 @@ pub(super) struct CostVolume {
 }
 
 impl CostVolume {
-    /// All zero.
-    pub fn new(pixels: usize, planes: usize) -> Self {
-        Self { planes, cost: vec![0; pixels * planes] }
-    }
-
-    /// Sets one cost, 0 to [`WORST`].
-    #[inline(always)]
-    pub fn set(&mut self, pixel: usize, plane: usize, cost: f32) {
-        self.cost[pixel * self.planes + plane] = (cost * SCALE) as u16;
+    /// From costs of 0 to [`WORST`], `[plane][pixel]`.
+    pub fn new(costs: &[f32], planes: usize) -> Self {
+        let pixels = costs.len() / planes;
+        let mut cost = vec![0; costs.len()];
+        // A few lines of every plane at a time: what is read and what is written then both stay in the cache.
+        for (n, out) in cost.chunks_mut(BLOCK * planes).enumerate() {
+            for (plane, costs) in costs.chunks_exact(pixels).enumerate() {
+                for (pixel, c) in costs[n * BLOCK..].iter().take(BLOCK).enumerate() {
+                    out[pixel * planes + plane] = (c * SCALE) as u16;
+                }
+            }
+        }
+        Self { planes, cost }
     }
 }
 
