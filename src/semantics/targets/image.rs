@@ -36,13 +36,20 @@ pub struct ImageTargetConfig {
     pub mode: ImageMode,
     /// Weight of the bounding box in `masks+boxes`, 0 to 1; the mask has the rest.
     pub box_weight: f32,
+    /// Whether a box weighs less where it shows other things than its mask; without, as in the paper, all weigh alike.
+    pub box_agreement: bool,
     /// Between patches.
     pub interpolation: Interpolation,
 }
 
 impl Default for ImageTargetConfig {
     fn default() -> Self {
-        Self { mode: ImageMode::default(), box_weight: 0.25, interpolation: Interpolation::default() }
+        Self {
+            mode: ImageMode::default(),
+            box_weight: 0.25,
+            box_agreement: true,
+            interpolation: Interpolation::default(),
+        }
     }
 }
 
@@ -202,7 +209,7 @@ fn read_masks(frame: &FrameFeatures, config: &ImageTargetConfig) -> Read {
         match &masks.boxes {
             Some(boxes) => {
                 warnings.extend(boxes.warning());
-                mix(&mut masks.masks, boxes, config.box_weight);
+                mix(&mut masks.masks, boxes, config);
             }
             None => warnings.push(format!(
                 "{}: no box descriptors (_b.npy) beside it; its masks stand alone",
@@ -226,20 +233,20 @@ fn read_patches(frame: &FrameFeatures) -> Read {
 
 /// φ = (1 − w) φ_mask + w φ_box of unit vectors, to unit length again (DIV-FF, 3.2; w = 0.25).
 ///
-/// A mask whose box cannot be used, or cancels it, stands alone.
-fn mix(masks: &mut Descriptors, boxes: &Descriptors, box_weight: f32) {
+/// A mask whose box cannot be used, or cancels it, stands alone. With `box_agreement`, w is that times [`agreement`].
+fn mix(masks: &mut Descriptors, boxes: &Descriptors, config: &ImageTargetConfig) {
     let dim = masks.dim;
-    let mut other = vec![0.0; dim];
-    for (n, row) in masks.values.chunks_exact_mut(dim).enumerate() {
-        normalise(row);
-        if !boxes.is_usable(n) {
-            continue;
-        }
-        other.copy_from_slice(boxes.row(n));
-        normalise(&mut other);
-        let mixed = |m: f32, b: f32| (1.0 - box_weight) * m + box_weight * b;
-        if row.iter().zip(&other).any(|(m, b)| mixed(*m, *b) != 0.0) {
-            row.iter_mut().zip(&other).for_each(|(m, b)| *m = mixed(*m, *b));
+    masks.values.chunks_exact_mut(dim).for_each(normalise);
+    let mut units = boxes.values.clone();
+    for (n, unit) in units.chunks_exact_mut(dim).enumerate() {
+        if boxes.is_usable(n) { normalise(unit) } else { unit.fill(0.0) }
+    }
+    let agreement = config.box_agreement.then(|| agreement(&masks.values, &units, dim));
+    for (n, (row, other)) in masks.values.chunks_exact_mut(dim).zip(units.chunks_exact(dim)).enumerate() {
+        let weight = config.box_weight * agreement.as_ref().map_or(1.0, |a| a[n]);
+        let mixed = |m: f32, b: f32| (1.0 - weight) * m + weight * b;
+        if boxes.is_usable(n) && row.iter().zip(other).any(|(m, b)| mixed(*m, *b) != 0.0) {
+            row.iter_mut().zip(other).for_each(|(m, b)| *m = mixed(*m, *b));
             normalise(row);
         }
     }
@@ -247,4 +254,30 @@ fn mix(masks: &mut Descriptors, boxes: &Descriptors, box_weight: f32) {
     for &(n, _) in &masks.left_out {
         masks.values[n * dim..(n + 1) * dim].fill(0.0);
     }
+}
+
+/// How much more each mask is like its own box than like the frame's other boxes: 1 where the box shows nothing else, 0
+/// where it might be any of them. Of unit vectors, or zeros.
+///
+/// All descriptors of an encoder resemble one another, so that a cosine by itself says little. The box around something
+/// small or thin shows mostly what is behind it.
+fn agreement(masks: &[f32], boxes: &[f32], dim: usize) -> Vec<f32> {
+    let used = boxes.chunks_exact(dim).filter(|b| b.iter().any(|v| *v != 0.0)).count();
+    if used < 2 {
+        // Nothing to be told from.
+        return vec![1.0; masks.len() / dim];
+    }
+    let mut all = vec![0.0; dim];
+    for row in boxes.chunks_exact(dim) {
+        all.iter_mut().zip(row).for_each(|(a, b)| *a += b);
+    }
+    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
+    let pairs = masks.chunks_exact(dim).zip(boxes.chunks_exact(dim));
+    pairs
+        .map(|(mask, own)| {
+            let cosine = dot(mask, own);
+            let others = (dot(mask, &all) - cosine) / (used - 1) as f32;
+            ((cosine - others) / (1.0 - others).max(f32::EPSILON)).clamp(0.0, 1.0)
+        })
+        .collect()
 }

@@ -9,6 +9,12 @@ fn image(scene: &FeatureScene, mode: ImageMode) -> ImageTargets {
     ImageTargets::load(&scene.store(), &scene.scene.frames, config).unwrap().unwrap()
 }
 
+/// With boxes that weigh alike.
+fn boxed(scene: &FeatureScene) -> ImageTargets {
+    let config = ImageTargetConfig { box_agreement: false, ..ImageTargetConfig::default() };
+    ImageTargets::load(&scene.store(), &scene.scene.frames, config).unwrap().unwrap()
+}
+
 /// The blended descriptor of a target.
 fn value(table: &TargetTable, blend: Blend) -> [f32; DIM] {
     let mut out = [0.0; DIM];
@@ -41,7 +47,7 @@ fn masks_give_every_pixel_its_own_and_none_outside() {
 #[test]
 fn boxes_weigh_a_quarter() {
     let scene = FeatureScene::new();
-    let targets = image(&scene, ImageMode::MasksAndBoxes);
+    let targets = boxed(&scene);
     assert_near(value(&targets.table, targets.at(0, 0, 0).unwrap()), [0.75, 0.0, 0.0, 0.25]);
     assert_eq!(targets.at(0, 0, 0).unwrap().iter().count(), 1, "one row, nothing to blend");
     assert!(targets.warnings.is_empty());
@@ -51,6 +57,32 @@ fn boxes_weigh_a_quarter() {
 fn lengths_of_descriptors_do_not_matter() {
     let scene = FeatureScene::new();
     scene.floats("language_features/frame_000000_b.npy", &[3, DIM], &[axis(3).map(|v| 50.0 * v); 3].concat());
+    let targets = boxed(&scene);
+    assert_near(value(&targets.table, targets.at(0, 0, 0).unwrap()), [0.75, 0.0, 0.0, 0.25]);
+}
+
+#[test]
+fn a_box_counts_as_far_as_it_shows_what_its_mask_does() {
+    let scene = FeatureScene::new();
+    // Pixels are in the masks of axes 0, on the left, and 2. The first box shows just its mask, the third its own and the first.
+    let boxes = [axis(0), axis(0), [1.0, 0.0, 1.0, 0.0]];
+    scene.floats("language_features/frame_000000_b.npy", &[3, DIM], &boxes.concat());
+    let targets = image(&scene, ImageMode::MasksAndBoxes);
+    assert_near(value(&targets.table, targets.at(0, 0, 0).unwrap()), axis(0));
+    // The third mask is like its own box by √½ and like the others not at all.
+    let (half, weight) = (0.5f32.sqrt(), 0.25 * 0.5f32.sqrt());
+    let expected = [weight * half, 0.0, 1.0 - weight + weight * half, 0.0];
+    assert_near(value(&targets.table, targets.at(0, 5, 0).unwrap()), expected);
+    scene.floats("language_features/frame_000000_b.npy", &[3, DIM], &[axis(0); 3].concat());
+    let targets = image(&scene, ImageMode::MasksAndBoxes);
+    assert_near(value(&targets.table, targets.at(0, 5, 0).unwrap()), axis(2));
+}
+
+#[test]
+fn a_box_without_others_to_be_told_from_counts_in_full() {
+    let scene = FeatureScene::new();
+    let nan = [f32::NAN; DIM];
+    scene.floats("language_features/frame_000000_b.npy", &[3, DIM], &[axis(3), nan, nan].concat());
     let targets = image(&scene, ImageMode::MasksAndBoxes);
     assert_near(value(&targets.table, targets.at(0, 0, 0).unwrap()), [0.75, 0.0, 0.0, 0.25]);
 }
