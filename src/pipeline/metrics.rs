@@ -104,6 +104,11 @@ pub fn skipped_in_training(state: &TrainingState, streams: [bool; 3]) -> BTreeMa
             format!("stereo finds the depth of {:.0} % of pixels from the poses as given", 100.0 * coverage);
         skipped.insert("pose_refinement".to_owned(), why.into());
     }
+    if let Some(seconds) = state.stereo_left_out {
+        let why =
+            format!("depth by stereo would have taken some {seconds:.0} s, too much of the time budget");
+        skipped.insert("stereo".to_owned(), why.into());
+    }
     skipped
 }
 

@@ -70,6 +70,9 @@ pub struct TrainingState {
     pub given_coverage: Option<f64>,
     /// Pose refinement and rig from which depth was looked for by stereo; `None` before it was.
     pub stereo_from: Option<Vec<f32>>,
+    /// Seconds that stereo would have taken, where that was too much of a time budget; `None` where it was not left out.
+    #[serde(default)]
+    pub stereo_left_out: Option<f64>,
     /// How many of the due alignments of the frames are done.
     pub aligned: usize,
     /// Steps after the end of the schedule, together with fields of features.

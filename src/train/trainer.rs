@@ -57,6 +57,10 @@ const MOVING_SHARE: f64 = 0.03;
 /// Frames by which poses are judged.
 const JUDGED_FRAMES: usize = 12;
 
+/// Share of a time budget that stereo may take where nothing moves: in a short one, that many more steps are worth more,
+/// for the picture and for the surface.
+const STEREO_SHARE: f64 = 0.1;
+
 /// Share of their pixels of which stereo finds the depth, from where poses need no refinement.
 const WELL_POSED: f64 = 0.2;
 
@@ -105,6 +109,8 @@ pub struct Trainer {
     /// Until they have told what moves.
     masks: Option<FrameMasks>,
     streams: [bool; 3],
+    /// Seconds that stereo of all frames will take, as far as judging the poses tells.
+    stereo_cost: Option<f64>,
 }
 
 impl Trainer {
@@ -137,6 +143,7 @@ impl Trainer {
             pixels,
             test,
             masks,
+            stereo_cost: None,
         })
     }
 
@@ -153,7 +160,16 @@ impl Trainer {
             true => trained.field.shape.streams,
             false => [true, false, false],
         };
-        Ok(Self { config: config.clone(), trained, optimiser, pixels, test, masks, streams })
+        Ok(Self {
+            config: config.clone(),
+            trained,
+            optimiser,
+            pixels,
+            test,
+            masks,
+            streams,
+            stereo_cost: None,
+        })
     }
 
     /// Trains to the end of the schedule, or until `budget` is used up (the schedule then follows the clock), or
@@ -181,7 +197,8 @@ impl Trainer {
             if !self.trained.progress.streams_settled && self.stands(fraction) {
                 self.settle_streams();
             }
-            if fraction >= self.config.train.stereo_at || self.trained.progress.stereo_from.is_some() {
+            let due = fraction >= self.config.train.stereo_at || self.trained.progress.stereo_from.is_some();
+            if due && !self.stereo_waits(budget) {
                 self.look_at_depth();
             }
             let due = self.config.train.align_at.iter().filter(|at| fraction >= **at).count();
@@ -334,7 +351,12 @@ impl Trainer {
         let refined = !train.align_at.is_empty() || train.pose_rate > 0.0 || train.rig_rate > 0.0;
         let judged = self.judged_frames();
         let Trained { field, progress, .. } = &mut self.trained;
+        let start = Instant::now();
         progress.given_coverage = refined.then(|| self.pixels.stereo_coverage(field, &judged, stereo));
+        // Frames are judged together with those that they are compared with.
+        let frames = self.pixels.frames.len();
+        let looked_at = (judged.len() * (1 + stereo.neighbours)).min(frames).max(1);
+        self.stereo_cost = refined.then(|| start.elapsed().as_secs_f64() * frames as f64 / looked_at as f64);
         progress.trusts_poses = progress.given_coverage.is_none_or(|share| share >= WELL_POSED);
         if progress.trusts_poses {
             self.look_at_depth();
@@ -347,10 +369,25 @@ impl Trainer {
         (0..frames).step_by(frames.div_ceil(JUDGED_FRAMES).max(1)).collect()
     }
 
+    /// Whether depth by stereo has to wait, because it takes too much of a time budget: until it is known whether anything
+    /// moves, which stereo would find; it is left out if nothing does. Without a budget, results must not depend on the clock.
+    fn stereo_waits(&mut self, budget: Option<Duration>) -> bool {
+        let (Some(budget), Some(cost)) = (budget, self.stereo_cost) else { return false };
+        let Trained { field, progress, .. } = &mut self.trained;
+        if progress.trusts_poses || cost <= STEREO_SHARE * budget.as_secs_f64() {
+            return false;
+        }
+        if progress.streams_settled && !field.shape.streams[Stream::Dynamic as usize] {
+            progress.stereo_left_out = Some(cost);
+        }
+        !progress.streams_settled
+    }
+
     /// Finds the depth of the training frames by stereo, unless that is done or not wanted: from where they are by now
     /// or from where they were given, whichever finds more; or from where they were when a training that goes on did so.
     fn look_at_depth(&mut self) {
-        if !self.pixels.stereo.is_empty() || self.config.train.stereo_at >= 1.0 {
+        let unwanted = self.config.train.stereo_at >= 1.0 || self.trained.progress.stereo_left_out.is_some();
+        if unwanted || !self.pixels.stereo.is_empty() {
             return;
         }
         if self.trained.progress.stereo_from.is_none() {

@@ -188,3 +188,29 @@ fn a_schedule_by_the_clock_begins_with_the_first_step() {
     trainer.trained.progress.seconds = 61.0;
     assert_eq!(trainer.fraction(budget), 1.0);
 }
+
+#[test]
+fn stereo_is_left_out_where_a_time_budget_is_too_short_for_it() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    let minute = Some(Duration::from_secs(60));
+    for (budget, cost, moves, left_out) in [
+        (minute, 20.0, false, true),
+        (minute, 1.0, false, false),
+        (minute, 20.0, true, false),
+        (None, 20.0, false, false),
+    ] {
+        let mut trainer = Trainer::new(&scene, &config(0.3)).expect("the scene is valid");
+        if !moves {
+            trainer.trained.keep_streams([true, false, false]);
+        }
+        trainer.stereo_cost = Some(cost);
+        assert_eq!(trainer.stereo_waits(budget), cost == 20.0 && budget.is_some(), "nothing is known yet");
+        trainer.trained.progress.streams_settled = true;
+        assert!(!trainer.stereo_waits(budget));
+        trainer.look_at_depth();
+        let found = !trainer.pixels.stereo.is_empty();
+        assert_eq!(found, !left_out, "{budget:?}, {cost} s, {moves}");
+        assert_eq!(trainer.trained.progress.stereo_left_out, left_out.then_some(cost));
+    }
+}
