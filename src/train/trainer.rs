@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
-use super::align;
 use super::checkpoint::{Trained, TrainingState};
 use super::config::StreamChoice;
 use super::error::TrainError;
@@ -14,15 +13,16 @@ use super::moving::masks::FrameMasks;
 use super::pixels::PixelSet;
 use super::step::{Companion, Optimiser, StepReport};
 use crate::config::Config;
-use crate::field::{Field, FieldShape, Normalisation, Stream};
+use crate::field::{Field, FieldShape, Normalisation};
 use crate::render::forward::{Grids, Model};
 use crate::render::image::render;
-use crate::render::sampler::Sampling;
 use crate::scene::features::FeatureStore;
 use crate::scene::{Frame, Scene, Split};
 
+mod poses;
 #[cfg(test)]
 mod skip_tests;
+mod streams;
 #[cfg(test)]
 mod tests;
 
@@ -37,32 +37,6 @@ const TEST_STRIDE: u32 = 8;
 
 /// Share of the light that a cell of a density grid must be able to stop for its stream to be evaluated there.
 const OCCUPIED_ALPHA: f32 = 0.005;
-
-/// Training frames that are looked at to decide whether anything moves.
-const LOOK_AT_FRAMES: usize = 24;
-
-/// Every how many pixels they are looked at, and how many of those make a block's side.
-const LOOK_STRIDE: u32 = 4;
-const LOOK_BLOCK: u32 = 4;
-
-/// Mean colour error of a block (0-1) that blur and noise do not explain.
-const WRONG_COLOUR: f32 = 0.12;
-
-/// Steps after which a persistent stream is sharp enough for that.
-const SETTLE_AFTER: u64 = 500;
-
-/// Share of such blocks above which something moves.
-const MOVING_SHARE: f64 = 0.03;
-
-/// Frames by which poses are judged.
-const JUDGED_FRAMES: usize = 12;
-
-/// Share of a time budget that stereo may take where nothing moves: in a short one, that many more steps are worth more,
-/// for the picture and for the surface.
-const STEREO_SHARE: f64 = 0.1;
-
-/// Share of their pixels of which stereo finds the depth, from where poses need no refinement.
-const WELL_POSED: f64 = 0.2;
 
 /// What the caller hears while training goes on; a line of a run's `log.jsonl`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -327,154 +301,6 @@ impl Trainer {
             Some(index) => Err(non_finite("a network weight", index)),
             None => Ok(report),
         }
-    }
-
-    /// Registers all training frames to what the field shows from where they are.
-    fn align(&mut self) {
-        let model = Model::new(&self.trained.field, &self.trained.grids, self.streams);
-        let sampling = Sampling { count: self.config.train.samples, ..self.config.train.render_sampling() };
-        let correction = align::align(&model, &self.pixels, &sampling);
-        correction.apply(&mut self.trained.field);
-        let a = correction.report;
-        tracing::info!(a.frames, a.rotation, a.translation, lens = ?a.lens, "frames aligned");
-    }
-
-    /// Asks stereo, before the first step, whether the poses as given are good enough to find depth from; then they are
-    /// not refined, and that depth is there from the start.
-    ///
-    /// Refinement follows a field that is not sharp yet. It mends poses that jitter by pixels, and makes exact ones worse.
-    fn judge_poses(&mut self) {
-        let Config { train, stereo, .. } = &self.config;
-        if train.stereo_at >= 1.0 {
-            return;
-        }
-        let refined = !train.align_at.is_empty() || train.pose_rate > 0.0 || train.rig_rate > 0.0;
-        let judged = self.judged_frames();
-        let Trained { field, progress, .. } = &mut self.trained;
-        let start = Instant::now();
-        progress.given_coverage = refined.then(|| self.pixels.stereo_coverage(field, &judged, stereo));
-        // Frames are judged together with those that they are compared with.
-        let frames = self.pixels.frames.len();
-        let looked_at = (judged.len() * (1 + stereo.neighbours)).min(frames).max(1);
-        self.stereo_cost = refined.then(|| start.elapsed().as_secs_f64() * frames as f64 / looked_at as f64);
-        progress.trusts_poses = progress.given_coverage.is_none_or(|share| share >= WELL_POSED);
-        if progress.trusts_poses {
-            self.look_at_depth();
-        }
-    }
-
-    /// A few training frames, evenly over the video.
-    fn judged_frames(&self) -> Vec<usize> {
-        let frames = self.pixels.frames.len();
-        (0..frames).step_by(frames.div_ceil(JUDGED_FRAMES).max(1)).collect()
-    }
-
-    /// Whether depth by stereo has to wait, because it takes too much of a time budget: until it is known whether anything
-    /// moves, which stereo would find; it is left out if nothing does. Without a budget, results must not depend on the clock.
-    fn stereo_waits(&mut self, budget: Option<Duration>) -> bool {
-        let (Some(budget), Some(cost)) = (budget, self.stereo_cost) else { return false };
-        let Trained { field, progress, .. } = &mut self.trained;
-        if progress.trusts_poses || cost <= STEREO_SHARE * budget.as_secs_f64() {
-            return false;
-        }
-        if progress.streams_settled && !field.shape.streams[Stream::Dynamic as usize] {
-            progress.stereo_left_out = Some(cost);
-        }
-        !progress.streams_settled
-    }
-
-    /// Finds the depth of the training frames by stereo, unless that is done or not wanted: from where they are by now
-    /// or from where they were given, whichever finds more; or from where they were when a training that goes on did so.
-    fn look_at_depth(&mut self) {
-        let unwanted = self.config.train.stereo_at >= 1.0 || self.trained.progress.stereo_left_out.is_some();
-        if unwanted || !self.pixels.stereo.is_empty() {
-            return;
-        }
-        if self.trained.progress.stereo_from.is_none() {
-            self.settle_poses();
-        }
-        let Trained { field, progress, .. } = &mut self.trained;
-        let refinement = field.layout.refinement();
-        let now = field.weights[refinement.clone()].to_vec();
-        let then = progress.stereo_from.get_or_insert_with(|| now.clone());
-        field.weights[refinement.clone()].copy_from_slice(then);
-        self.pixels.look_at_depth(field, progress.trusts_poses, &self.config.stereo);
-        if field.shape.streams[Stream::Dynamic as usize] && self.config.loss.moving > 0.0 {
-            self.pixels.look_for_movement(field, self.masks.take().as_ref());
-        }
-        field.weights[refinement].copy_from_slice(&now);
-    }
-
-    /// Undoes the refinement of the poses if stereo finds less from them than from the poses as they were given.
-    fn settle_poses(&mut self) {
-        let Some(given) = self.trained.progress.given_coverage else { return };
-        if self.trained.progress.trusts_poses {
-            return;
-        }
-        let judged = self.judged_frames();
-        let Trained { field, progress, .. } = &mut self.trained;
-        let refined = self.pixels.stereo_coverage(field, &judged, &self.config.stereo);
-        if refined < given {
-            let refinement = field.layout.refinement();
-            field.weights[refinement].fill(0.0);
-            progress.trusts_poses = true;
-        }
-        tracing::info!(given, refined, "depth by stereo from poses as given and as refined");
-    }
-
-    /// Whether the persistent stream has had its time alone. A short training gives it more than its share, up to double
-    /// and half of all, since what is still blurred looks like something that has moved.
-    fn stands(&self, fraction: f64) -> bool {
-        let share = self.config.train.static_until;
-        let late = (2.0 * share).min(0.5).max(share);
-        fraction >= share && (self.trained.progress.step >= SETTLE_AFTER || fraction >= late)
-    }
-
-    /// Decides which streams the scene needs, once the persistent one has had its time alone.
-    fn settle_streams(&mut self) {
-        if self.config.train.streams == StreamChoice::Auto {
-            let unexplained = self.unexplained();
-            self.trained.progress.unexplained = Some(unexplained);
-            if unexplained < MOVING_SHARE {
-                self.trained.keep_streams([true, false, false]);
-                self.optimiser.keep_streams(&self.trained.field);
-            }
-        }
-        self.streams = self.trained.field.shape.streams;
-        self.trained.progress.streams_settled = true;
-    }
-
-    /// Share of image blocks whose mean colour the persistent stream gets wrong.
-    ///
-    /// Blur, noise and misplaced edges average out over a block; a hand or an object that has moved does not.
-    fn unexplained(&self) -> f64 {
-        let model = Model::new(&self.trained.field, &self.trained.grids, [true, false, false]);
-        let sampling = self.config.train.render_sampling();
-        let every = self.pixels.frames.len().div_ceil(LOOK_AT_FRAMES);
-        let (mut wrong, mut blocks) = (0usize, 0usize);
-        for n in (0..self.pixels.frames.len()).step_by(every) {
-            let frame = &self.pixels.frames[n];
-            let image = render(&model, frame, &sampling, LOOK_STRIDE);
-            let truth = |x: u32, y: u32| {
-                self.pixels.images[n][(y * LOOK_STRIDE * frame.camera.width + x * LOOK_STRIDE) as usize]
-            };
-            for by in 0..image.height / LOOK_BLOCK {
-                for bx in 0..image.width / LOOK_BLOCK {
-                    let mut sum = [0.0f32; 3];
-                    for k in 0..LOOK_BLOCK * LOOK_BLOCK {
-                        let (x, y) = (bx * LOOK_BLOCK + k % LOOK_BLOCK, by * LOOK_BLOCK + k / LOOK_BLOCK);
-                        let (rgb, truth) = (image.rgb[(y * image.width + x) as usize], truth(x, y));
-                        for c in 0..3 {
-                            sum[c] += rgb[c] - f32::from(truth[c]) / 255.0;
-                        }
-                    }
-                    let mean = sum.map(|s| (s / (LOOK_BLOCK * LOOK_BLOCK) as f32).abs());
-                    wrong += usize::from(mean.into_iter().fold(0.0, f32::max) > WRONG_COLOUR);
-                    blocks += 1;
-                }
-            }
-        }
-        wrong as f64 / blocks.max(1) as f64
     }
 
     fn test_psnr(&self) -> Option<f64> {

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::render::image::RenderedFrame;
+use crate::render::sampler::Sampling;
 use crate::train::testing;
 
 /// A field that learned the wall, with cells in which a stream is skipped.

@@ -1,0 +1,116 @@
+//! Where the frames are, and the depth that follows from it: how far the poses are trusted, alignment, stereo.
+
+use std::time::{Duration, Instant};
+
+use super::Trainer;
+use crate::config::Config;
+use crate::field::Stream;
+use crate::render::forward::Model;
+use crate::render::sampler::Sampling;
+use crate::train::align;
+use crate::train::checkpoint::Trained;
+
+/// Frames by which poses are judged.
+const JUDGED_FRAMES: usize = 12;
+
+/// Share of a time budget that stereo may take where nothing moves: in a short one, that many more steps are worth more,
+/// for the picture and for the surface.
+const STEREO_SHARE: f64 = 0.1;
+
+/// Share of their pixels of which stereo finds the depth, from where poses need no refinement.
+const WELL_POSED: f64 = 0.2;
+
+impl Trainer {
+    /// Registers all training frames to what the field shows from where they are.
+    pub(super) fn align(&mut self) {
+        let model = Model::new(&self.trained.field, &self.trained.grids, self.streams);
+        let sampling = Sampling { count: self.config.train.samples, ..self.config.train.render_sampling() };
+        let correction = align::align(&model, &self.pixels, &sampling);
+        correction.apply(&mut self.trained.field);
+        let a = correction.report;
+        tracing::info!(a.frames, a.rotation, a.translation, lens = ?a.lens, "frames aligned");
+    }
+
+    /// Asks stereo, before the first step, whether the poses as given are good enough to find depth from; then they are
+    /// not refined, and that depth is there from the start.
+    ///
+    /// Refinement follows a field that is not sharp yet. It mends poses that jitter by pixels, and makes exact ones worse.
+    pub(super) fn judge_poses(&mut self) {
+        let Config { train, stereo, .. } = &self.config;
+        if train.stereo_at >= 1.0 {
+            return;
+        }
+        let refined = !train.align_at.is_empty() || train.pose_rate > 0.0 || train.rig_rate > 0.0;
+        let judged = self.judged_frames();
+        let Trained { field, progress, .. } = &mut self.trained;
+        let start = Instant::now();
+        progress.given_coverage = refined.then(|| self.pixels.stereo_coverage(field, &judged, stereo));
+        // Frames are judged together with those that they are compared with.
+        let frames = self.pixels.frames.len();
+        let looked_at = (judged.len() * (1 + stereo.neighbours)).min(frames).max(1);
+        self.stereo_cost = refined.then(|| start.elapsed().as_secs_f64() * frames as f64 / looked_at as f64);
+        progress.trusts_poses = progress.given_coverage.is_none_or(|share| share >= WELL_POSED);
+        if progress.trusts_poses {
+            self.look_at_depth();
+        }
+    }
+
+    /// A few training frames, evenly over the video.
+    fn judged_frames(&self) -> Vec<usize> {
+        let frames = self.pixels.frames.len();
+        (0..frames).step_by(frames.div_ceil(JUDGED_FRAMES).max(1)).collect()
+    }
+
+    /// Whether depth by stereo has to wait, because it takes too much of a time budget: until it is known whether anything
+    /// moves, which stereo would find; it is left out if nothing does. Without a budget, results must not depend on the clock.
+    pub(super) fn stereo_waits(&mut self, budget: Option<Duration>) -> bool {
+        let (Some(budget), Some(cost)) = (budget, self.stereo_cost) else { return false };
+        let Trained { field, progress, .. } = &mut self.trained;
+        if progress.trusts_poses || cost <= STEREO_SHARE * budget.as_secs_f64() {
+            return false;
+        }
+        if progress.streams_settled && !field.shape.streams[Stream::Dynamic as usize] {
+            progress.stereo_left_out = Some(cost);
+        }
+        !progress.streams_settled
+    }
+
+    /// Finds the depth of the training frames by stereo, unless that is done or not wanted: from where they are by now
+    /// or from where they were given, whichever finds more; or from where they were when a training that goes on did so.
+    pub(super) fn look_at_depth(&mut self) {
+        let unwanted = self.config.train.stereo_at >= 1.0 || self.trained.progress.stereo_left_out.is_some();
+        if unwanted || !self.pixels.stereo.is_empty() {
+            return;
+        }
+        if self.trained.progress.stereo_from.is_none() {
+            self.settle_poses();
+        }
+        let Trained { field, progress, .. } = &mut self.trained;
+        let refinement = field.layout.refinement();
+        let now = field.weights[refinement.clone()].to_vec();
+        let then = progress.stereo_from.get_or_insert_with(|| now.clone());
+        field.weights[refinement.clone()].copy_from_slice(then);
+        self.pixels.look_at_depth(field, progress.trusts_poses, &self.config.stereo);
+        if field.shape.streams[Stream::Dynamic as usize] && self.config.loss.moving > 0.0 {
+            self.pixels.look_for_movement(field, self.masks.take().as_ref());
+        }
+        field.weights[refinement].copy_from_slice(&now);
+    }
+
+    /// Undoes the refinement of the poses if stereo finds less from them than from the poses as they were given.
+    pub(super) fn settle_poses(&mut self) {
+        let Some(given) = self.trained.progress.given_coverage else { return };
+        if self.trained.progress.trusts_poses {
+            return;
+        }
+        let judged = self.judged_frames();
+        let Trained { field, progress, .. } = &mut self.trained;
+        let refined = self.pixels.stereo_coverage(field, &judged, &self.config.stereo);
+        if refined < given {
+            let refinement = field.layout.refinement();
+            field.weights[refinement].fill(0.0);
+            progress.trusts_poses = true;
+        }
+        tracing::info!(given, refined, "depth by stereo from poses as given and as refined");
+    }
+}

@@ -1,0 +1,79 @@
+//! Which streams a scene needs: whether anything moves that the persistent one leaves unexplained.
+
+use super::Trainer;
+use crate::render::forward::Model;
+use crate::render::image::render;
+use crate::train::config::StreamChoice;
+
+/// Training frames that are looked at to decide whether anything moves.
+const LOOK_AT_FRAMES: usize = 24;
+
+/// Every how many pixels they are looked at, and how many of those make a block's side.
+const LOOK_STRIDE: u32 = 4;
+const LOOK_BLOCK: u32 = 4;
+
+/// Mean colour error of a block (0-1) that blur and noise do not explain.
+const WRONG_COLOUR: f32 = 0.12;
+
+/// Steps after which a persistent stream is sharp enough for that.
+const SETTLE_AFTER: u64 = 500;
+
+/// Share of such blocks above which something moves.
+const MOVING_SHARE: f64 = 0.03;
+
+impl Trainer {
+    /// Whether the persistent stream has had its time alone. A short training gives it more than its share, up to double
+    /// and half of all, since what is still blurred looks like something that has moved.
+    pub(super) fn stands(&self, fraction: f64) -> bool {
+        let share = self.config.train.static_until;
+        let late = (2.0 * share).min(0.5).max(share);
+        fraction >= share && (self.trained.progress.step >= SETTLE_AFTER || fraction >= late)
+    }
+
+    /// Decides which streams the scene needs, once the persistent one has had its time alone.
+    pub(super) fn settle_streams(&mut self) {
+        if self.config.train.streams == StreamChoice::Auto {
+            let unexplained = self.unexplained();
+            self.trained.progress.unexplained = Some(unexplained);
+            if unexplained < MOVING_SHARE {
+                self.trained.keep_streams([true, false, false]);
+                self.optimiser.keep_streams(&self.trained.field);
+            }
+        }
+        self.streams = self.trained.field.shape.streams;
+        self.trained.progress.streams_settled = true;
+    }
+
+    /// Share of image blocks whose mean colour the persistent stream gets wrong.
+    ///
+    /// Blur, noise and misplaced edges average out over a block; a hand or an object that has moved does not.
+    fn unexplained(&self) -> f64 {
+        let model = Model::new(&self.trained.field, &self.trained.grids, [true, false, false]);
+        let sampling = self.config.train.render_sampling();
+        let every = self.pixels.frames.len().div_ceil(LOOK_AT_FRAMES);
+        let (mut wrong, mut blocks) = (0usize, 0usize);
+        for n in (0..self.pixels.frames.len()).step_by(every) {
+            let frame = &self.pixels.frames[n];
+            let image = render(&model, frame, &sampling, LOOK_STRIDE);
+            let truth = |x: u32, y: u32| {
+                self.pixels.images[n][(y * LOOK_STRIDE * frame.camera.width + x * LOOK_STRIDE) as usize]
+            };
+            for by in 0..image.height / LOOK_BLOCK {
+                for bx in 0..image.width / LOOK_BLOCK {
+                    let mut sum = [0.0f32; 3];
+                    for k in 0..LOOK_BLOCK * LOOK_BLOCK {
+                        let (x, y) = (bx * LOOK_BLOCK + k % LOOK_BLOCK, by * LOOK_BLOCK + k / LOOK_BLOCK);
+                        let (rgb, truth) = (image.rgb[(y * image.width + x) as usize], truth(x, y));
+                        for c in 0..3 {
+                            sum[c] += rgb[c] - f32::from(truth[c]) / 255.0;
+                        }
+                    }
+                    let mean = sum.map(|s| (s / (LOOK_BLOCK * LOOK_BLOCK) as f32).abs());
+                    wrong += usize::from(mean.into_iter().fold(0.0, f32::max) > WRONG_COLOUR);
+                    blocks += 1;
+                }
+            }
+        }
+        wrong as f64 / blocks.max(1) as f64
+    }
+}
