@@ -234,10 +234,11 @@ impl Window {
                     *m *= b;
                 }
             }
-            let at = |shift: usize| &padded[shift..shift + width];
-            let [p, q, r, s, t] = [at(0), at(1), at(2), at(3), at(4)];
-            for x in 0..width {
-                row[x] = ((((r[x] + q[x]) + s[x]) + p[x]) + t[x]) * shares[x];
+            let (p, q, r) = (&padded[..], &padded[1..], &padded[2..]);
+            let (s, t) = (&padded[3..], &padded[4..]);
+            let window = p.iter().zip(q).zip(r).zip(s).zip(t);
+            for ((o, share), ((((p, q), r), s), t)) in row.iter_mut().zip(shares.iter()).zip(window) {
+                *o = ((((r + q) + s) + p) + t) * share;
             }
         }
         for (y, out) in out.chunks_exact_mut(width).enumerate() {
@@ -247,8 +248,9 @@ impl Window {
             };
             let [p, q, r, s, t] = [line(0), line(1), line(2), line(3), line(4)];
             let share = share(y, height);
-            for x in 0..width {
-                out[x] = ((((p[x] + q[x]) + r[x]) + s[x]) + t[x]) * share;
+            let window = p.iter().zip(q).zip(r).zip(s).zip(t);
+            for (o, ((((p, q), r), s), t)) in out.iter_mut().zip(window) {
+                *o = ((((p + q) + r) + s) + t) * share;
             }
         }
     }

@@ -26,8 +26,10 @@ const LONG: usize = 128;
 const FEW: usize = 8;
 /// Points that share a phrase's numbers then.
 const PAIR: usize = 2;
-/// Bytes of long features that are asked for before they are needed: the processor's own prediction stops at pages.
+/// Bytes of features that are asked for before they are needed: the processor's own prediction stops at pages.
 const AHEAD: usize = 4096;
+/// Numbers that are asked for together: a cache line of 64 bytes.
+const LINE: usize = 16;
 
 /// Below this share of its summands, a squared length in f32 has lost digits; the point is computed again in f64.
 const CANCELLED: f32 = 0.05;
@@ -129,6 +131,9 @@ impl WithSimd for Run<'_, '_> {
                 for ((columns, offsets), out) in panels.zip(&mut products) {
                     let out = out.as_chunks_mut::<TOGETHER>().0.iter_mut();
                     for (out, rows) in out.zip(rows.chunks_exact(TOGETHER * dim)) {
+                        for line in rows.chunks(LINE) {
+                            simd::prefetch(&line[0], AHEAD);
+                        }
                         multiply(simd, columns, offsets, rows, out);
                     }
                 }
