@@ -131,8 +131,11 @@ impl WithSimd for Run<'_, '_> {
                 for ((columns, offsets), out) in panels.zip(&mut products) {
                     let out = out.as_chunks_mut::<TOGETHER>().0.iter_mut();
                     for (out, rows) in out.zip(rows.chunks_exact(TOGETHER * dim)) {
-                        for line in rows.chunks(LINE) {
-                            simd::prefetch(&line[0], AHEAD);
+                        // What has been widened is in the cache already.
+                        if matches!(points, Points::F32(_)) {
+                            for line in rows.chunks(LINE) {
+                                simd::prefetch(&line[0], AHEAD);
+                            }
                         }
                         multiply(simd, columns, offsets, rows, out);
                     }

@@ -48,7 +48,9 @@ impl Trainer {
         // Frames are judged together with those that they are compared with.
         let frames = self.pixels.frames.len();
         let looked_at = (judged.len() * (1 + stereo.neighbours)).min(frames).max(1);
-        self.stereo_cost = refined.then(|| start.elapsed().as_secs_f64() * frames as f64 / looked_at as f64);
+        // Refined poses are judged once more.
+        let times = 1.0 + frames as f64 / looked_at as f64;
+        self.stereo_cost = refined.then(|| start.elapsed().as_secs_f64() * times);
         progress.trusts_poses = progress.given_coverage.is_none_or(|share| share >= WELL_POSED);
         if progress.trusts_poses {
             self.look_at_depth();
