@@ -25,10 +25,17 @@ step "lints"
 cargo clippy --workspace --all-targets --locked --release -- -D warnings
 
 step "licences and sources of dependencies, and what is known against them"
-if cargo deny --version 2> /dev/null; then
-    cargo deny --all-features check
+deny=(cargo deny --all-features --locked)
+if ! cargo deny --version 2> /dev/null; then
+    echo "!! NOT CHECKED: cargo-deny is not installed (cargo install cargo-deny --locked)"
 else
-    echo "cargo-deny is not installed (cargo install cargo-deny): not checked"
+    "${deny[@]}" check licenses bans sources
+    # Without a network the database cannot be had; what it says has to fail the run, that it is missing has not.
+    if cargo deny fetch db; then
+        "${deny[@]}" check advisories
+    else
+        echo "!! NOT CHECKED: known vulnerabilities, for the advisory database could not be fetched (see above)"
+    fi
 fi
 
 step "documentation"
