@@ -75,7 +75,8 @@ impl Config {
     pub fn preset(preset: Preset) -> Self {
         let mut config = Self::default();
         match preset {
-            Preset::Draft => config.train.steps = 700,
+            // Of few rays, more steps of fewer each teach more: poses and what moves wait for steps.
+            Preset::Draft => (config.train.steps, config.train.rays) = (1400, 2048),
             Preset::Standard => {}
             Preset::Fine => config.train.steps *= 5,
         }
