@@ -257,7 +257,8 @@ mod tests {
         b.train.checkpoint_seconds = 1.0;
         assert_eq!(first_difference(&a, &b).unwrap(), None);
         b.train.rays = 64;
-        assert_eq!(first_difference(&a, &b).unwrap().unwrap(), "train.rays is 4096 there and 64 now");
+        let rays = format!("train.rays is {} there and 64 now", a.train.rays);
+        assert_eq!(first_difference(&a, &b).unwrap().unwrap(), rays);
         b = a.clone();
         b.time_budget_s = Some(90.0);
         assert_eq!(first_difference(&a, &b).unwrap().unwrap(), "time_budget_s is not set there and 90.0 now");
