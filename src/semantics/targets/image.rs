@@ -9,6 +9,7 @@ use crate::scene::Frame;
 use crate::scene::features::{
     Blend, Descriptors, FeatureError, FeatureStore, FrameFeatures, Interpolation, Masks, PatchGrid, normalise,
 };
+use crate::simd;
 
 /// What a pixel's image-language feature is learned from: the paper's ablations.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -271,12 +272,11 @@ fn agreement(masks: &[f32], boxes: &[f32], dim: usize) -> Vec<f32> {
     for row in boxes.chunks_exact(dim) {
         all.iter_mut().zip(row).for_each(|(a, b)| *a += b);
     }
-    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
     let pairs = masks.chunks_exact(dim).zip(boxes.chunks_exact(dim));
     pairs
         .map(|(mask, own)| {
-            let cosine = dot(mask, own);
-            let others = (dot(mask, &all) - cosine) / (used - 1) as f32;
+            let cosine = simd::dot(mask, own);
+            let others = (simd::dot(mask, &all) - cosine) / (used - 1) as f32;
             ((cosine - others) / (1.0 - others).max(f32::EPSILON)).clamp(0.0, 1.0)
         })
         .collect()
