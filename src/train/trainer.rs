@@ -170,6 +170,7 @@ impl Trainer {
             let fraction = self.fraction(budget);
             if !self.trained.progress.streams_settled && self.stands(fraction) {
                 self.settle_streams();
+                self.leave_out_stereo(budget);
             }
             let due = fraction >= self.config.train.stereo_at || self.trained.progress.stereo_from.is_some();
             if due && !self.stereo_waits(budget) {

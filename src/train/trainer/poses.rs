@@ -64,17 +64,23 @@ impl Trainer {
     }
 
     /// Whether depth by stereo has to wait, because it takes too much of a time budget: until it is known whether anything
-    /// moves, which stereo would find; it is left out if nothing does. Without a budget, results must not depend on the clock.
-    pub(super) fn stereo_waits(&mut self, budget: Option<Duration>) -> bool {
-        let (Some(budget), Some(cost)) = (budget, self.stereo_cost) else { return false };
-        let Trained { field, progress, .. } = &mut self.trained;
-        if progress.trusts_poses || cost <= STEREO_SHARE * budget.as_secs_f64() {
-            return false;
+    /// moves, which stereo would find.
+    pub(super) fn stereo_waits(&self, budget: Option<Duration>) -> bool {
+        !self.trained.progress.streams_settled && self.stereo_too_long(budget).is_some()
+    }
+
+    /// Leaves stereo out for good where it takes too much of a time budget and nothing moves.
+    pub(super) fn leave_out_stereo(&mut self, budget: Option<Duration>) {
+        if !self.trained.field.shape.streams[Stream::Dynamic as usize] {
+            self.trained.progress.stereo_left_out = self.stereo_too_long(budget);
         }
-        if progress.streams_settled && !field.shape.streams[Stream::Dynamic as usize] {
-            progress.stereo_left_out = Some(cost);
-        }
-        !progress.streams_settled
+    }
+
+    /// Seconds that stereo would take, where they are too many of a time budget. Without one, results must not depend on
+    /// the clock.
+    fn stereo_too_long(&self, budget: Option<Duration>) -> Option<f64> {
+        let most = STEREO_SHARE * budget?.as_secs_f64();
+        self.stereo_cost.filter(|cost| !self.trained.progress.trusts_poses && *cost > most)
     }
 
     /// Finds the depth of the training frames by stereo, unless that is done or not wanted: from where they are by now

@@ -207,6 +207,7 @@ fn stereo_is_left_out_where_a_time_budget_is_too_short_for_it() {
         trainer.stereo_cost = Some(cost);
         assert_eq!(trainer.stereo_waits(budget), cost == 20.0 && budget.is_some(), "nothing is known yet");
         trainer.trained.progress.streams_settled = true;
+        trainer.leave_out_stereo(budget);
         assert!(!trainer.stereo_waits(budget));
         trainer.look_at_depth();
         let found = !trainer.pixels.stereo.is_empty();
