@@ -177,6 +177,7 @@ impl Config {
             ("train.static_until", t.static_until),
             ("train.refine_from", t.refine_from),
             ("train.skip_from", t.skip_from),
+            ("train.faint", f64::from(t.faint)),
             ("train.grid_rate", f64::from(t.grid_rate)),
         ] {
             range(key, share.to_string(), (0.0..=1.0).contains(&share), "must be 0 to 1")?;

@@ -66,10 +66,15 @@ impl StreamSamples {
     /// Zeros for `n` samples.
     pub fn reset(&mut self, n: usize) {
         self.sigma.clear();
-        self.sigma.resize(n, 0.0);
         self.rgb.clear();
-        self.rgb.resize(n, [0.0; 3]);
         self.beta.clear();
+        self.resize(n);
+    }
+
+    /// Room for `n` samples; what is there already is left.
+    pub fn resize(&mut self, n: usize) {
+        self.sigma.resize(n, 0.0);
+        self.rgb.resize(n, [0.0; 3]);
         self.beta.resize(n, 0.0);
     }
 }
@@ -120,6 +125,17 @@ pub struct StreamBatch {
     pub levels: Vec<LevelRows>,
     /// Whether the gradient with respect to the positions will be asked for.
     pub slopes: bool,
+    /// Lanes that [`Self::retain`] leaves.
+    kept: Vec<u32>,
+}
+
+/// Leaves what stands at the places `kept`, in increasing order, of `values`.
+#[inline(always)]
+fn compact<T: Copy>(values: &mut Vec<T>, kept: &[u32]) {
+    for (to, from) in kept.iter().enumerate() {
+        values[to] = values[*from as usize];
+    }
+    values.truncate(kept.len());
 }
 
 impl StreamBatch {
@@ -144,6 +160,32 @@ impl StreamBatch {
         self.pos[tile][TIME][lane] = time;
         self.sample.push(sample as u32);
         self.ray.push(ray as u32);
+    }
+
+    /// Leaves the samples of whose number in the chunk `keep` is true, encoded as they are.
+    #[inline(always)]
+    pub fn retain(&mut self, keep: impl Fn(usize) -> bool) {
+        let Self { sample, ray, pos, levels, slopes, kept } = self;
+        kept.clear();
+        kept.extend((0..sample.len() as u32).filter(|lane| keep(sample[*lane as usize] as usize)));
+        let tiles = kept.len().div_ceil(TILE);
+        compact(sample, kept);
+        compact(ray, kept);
+        // No sample moves towards the end: its new place has been read before.
+        for (to, from) in kept.iter().map(|n| *n as usize).enumerate() {
+            for axis in 0..AXES {
+                pos[to / TILE][axis][to % TILE] = pos[from / TILE][axis][from % TILE];
+            }
+        }
+        pos.truncate(tiles);
+        for level in levels {
+            compact(&mut level.rows, kept);
+            level.rows.resize(tiles * TILE, Row::ZERO);
+            if *slopes {
+                compact(&mut level.slopes, kept);
+                level.slopes.resize(tiles * TILE, [Row::ZERO; 3]);
+            }
+        }
     }
 
     /// Number of samples.
@@ -269,7 +311,7 @@ impl StreamNet {
         self.trunk.reserve(w.trunk, batch.pos.len(), trunk);
         self.head.reserve(w.head, batch.pos.len(), head);
         for (n, lanes) in batch.sample.chunks(TILE).enumerate() {
-            self.trunk_forward(simd, &unit, w, batch, n, trunk, n, &code);
+            self.trunk_forward(simd, &unit, w, batch, n, trunk, n, &code, self.trunk.output());
             let geometry = trunk.output(n);
             let (features, rest) = head.input(n).split_at_mut(geometry.len());
             features.copy_from_slice(geometry);
@@ -312,14 +354,14 @@ impl StreamNet {
         let trunk = &mut activations.trunk;
         self.trunk.reserve(w.trunk, 1, trunk);
         for (n, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
-            self.trunk_forward(simd, &unit, w, batch, n, trunk, 0, &code);
+            self.trunk_forward(simd, &unit, w, batch, n, trunk, 0, &code, 1);
             for (o, r) in out.iter_mut().zip(trunk.output(0)) {
                 *o = simd::exp((*r + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
             }
         }
     }
 
-    /// The trunk on tile `tile` of a batch, as tile `n` of the activations.
+    /// The trunk on tile `tile` of a batch, as tile `n` of the activations: its first `outputs` outputs.
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
     fn trunk_forward<'c, S: Simd>(
@@ -332,13 +374,14 @@ impl StreamNet {
         trunk: &mut Activations,
         n: usize,
         code: &impl Fn(usize) -> &'c [f32],
+        outputs: usize,
     ) {
         let (features, rest) = trunk.input(n).split_at_mut(self.encoding.width() * TILE);
         for (level, out) in batch.levels.iter().zip(features.chunks_exact_mut(FEATURES * TILE)) {
             level.read_tile(tile, out);
         }
         condition(rest, self.code, batch.rays(tile), code);
-        self.trunk.forward(simd, unit, w.trunk, trunk, n);
+        self.trunk.forward_first(simd, unit, w.trunk, trunk, n, outputs);
     }
 
     /// Back-propagates through the evaluation that [`Self::forward`] left in `activations`.
@@ -443,4 +486,53 @@ pub struct StreamRanges {
     pub head: Range<usize>,
     /// Γ of the frame code; empty without one.
     pub code: Range<usize>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{EncodingKind, Field, Stream};
+    use crate::rng::Rng;
+    use crate::train::testing;
+
+    /// Samples with the given numbers, five to a ray, encoded by a field of random tables.
+    fn encoded(numbers: impl Iterator<Item = usize>, slopes: bool) -> StreamBatch {
+        let mut field = Field::zeros(testing::shape(&testing::config_of(EncodingKind::Hash)));
+        let mut rng = Rng::new(1, 0, 0);
+        for row in field.tables.iter_mut().flatten().flatten() {
+            *row = Row::new(rng.uniform(), rng.uniform(), rng.uniform(), rng.uniform());
+        }
+        let mut batch = StreamBatch { slopes, ..StreamBatch::default() };
+        for n in numbers {
+            let mut rng = Rng::new(2, n as u64, 0);
+            let p = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform());
+            batch.push(n, n / 5, p, rng.uniform());
+        }
+        let net = field.net(Stream::Dynamic).expect("all streams are on");
+        for task in batch.tasks(&net.encoding, &field.tables[Stream::Dynamic as usize]) {
+            task.run();
+        }
+        batch
+    }
+
+    #[test]
+    fn what_is_retained_is_as_if_there_had_been_nothing_else() {
+        // None, within a tile, several tiles, all.
+        for every in [1000, 90, 3, 1] {
+            for slopes in [false, true] {
+                let keep = |n: usize| n % every == every - 1;
+                let mut batch = encoded(0..200, slopes);
+                batch.retain(keep);
+                let alone = encoded((0..200).filter(|n| keep(*n)), slopes);
+                assert_eq!((&batch.sample, &batch.ray), (&alone.sample, &alone.ray));
+                assert_eq!(batch.pos.len(), alone.pos.len());
+                assert!(batch.points().eq(alone.points()));
+                for (a, b) in batch.levels.iter().zip(&alone.levels) {
+                    assert_eq!(a.rows, b.rows);
+                    let lanes = if slopes { batch.len() } else { 0 };
+                    assert_eq!(a.slopes[..lanes], b.slopes[..lanes]);
+                }
+            }
+        }
+    }
 }

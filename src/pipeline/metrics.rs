@@ -112,10 +112,12 @@ pub fn skipped_in_training(state: &TrainingState, streams: [bool; 3]) -> BTreeMa
     skipped
 }
 
-/// The work that training saved: at points where the density grids say that a stream has nothing, for streams that the
-/// scene does not have, behind what lets no light through, and for poses that were exact already.
-pub fn saved_in_training(state: &TrainingState) -> [(&'static str, Work); 4] {
+/// The work that training saved: at points where the density grids say that a stream has nothing, or where it gives all but
+/// no light (colours, and the way back), for streams that the scene does not have, behind what lets no light through, and
+/// for poses that were exact already.
+pub fn saved_in_training(state: &TrainingState) -> [(&'static str, Work); 5] {
     [
+        ("faint_samples", Work::samples(state.faint)),
         ("empty_space", Work::samples(state.candidates.saturating_sub(state.evaluations))),
         ("absent_streams", Work::samples(state.absent)),
         ("saturated_rays", Work::samples(state.spared)),

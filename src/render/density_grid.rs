@@ -100,12 +100,12 @@ impl DensityGrid {
         ((cell + u) / self.per_unit, time)
     }
 
-    /// Moves the cell of `p` towards `sigma` by the fraction `rate`.
+    /// Moves cell number `cell` towards `sigma` by the fraction `rate`.
     ///
     /// A mean, not a maximum: an envelope makes fog look opaque, so that what is behind it is never sampled again.
     #[inline(always)]
-    pub fn observe(&mut self, p: Vec3, slice: usize, sigma: f32, rate: f32) {
-        let n = self.index(p, slice);
-        self.sigma[n] += rate * (sigma - self.sigma[n]);
+    pub fn observe(&mut self, cell: usize, sigma: f32, rate: f32) {
+        let old = &mut self.sigma[cell];
+        *old += rate * (sigma - *old);
     }
 }

@@ -191,6 +191,8 @@ pub struct Tracer {
     /// Places samples, and counts what that was spared.
     pub sampler: Sampler,
     edges: Vec<f32>,
+    /// Densities in the order of a batch.
+    sigma: Vec<f32>,
     /// What the networks of each stream left for the way back.
     pub activations: [StreamActivations; 3],
 }
@@ -208,10 +210,39 @@ pub struct Chunk {
     pub intervals: Vec<Interval>,
     /// `[rays * count]`.
     pub weighted: Vec<Weighted>,
-    /// Which samples each stream is evaluated at.
+    /// Which samples each stream is evaluated at; after [`Self::evaluate`] those that are not faint.
     pub batches: [StreamBatch; 3],
+    /// Samples at which each stream has a density, faint or not, and the cell of its density grid that each is in.
+    pub cells: [Vec<Placed>; 3],
     /// What each stream said; zero where it was not evaluated.
     pub samples: [StreamSamples; 3],
+}
+
+/// Which samples of a stream are too faint for more than their density to be looked at; by default none are.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Faint {
+    /// Share of its pixel's light that a stream has to give at a sample; 0: everything counts.
+    pub share: f32,
+    /// Price of an optical depth of 1 of what moves: where that has one of so much, it counts, seen or not.
+    pub transient: f32,
+}
+
+impl Faint {
+    /// Whether stream `s` is too faint at a sample.
+    #[inline(always)]
+    fn is(self, s: usize, interval: &Interval, weighted: &Weighted) -> bool {
+        let price = if s > 0 { self.transient } else { 0.0 };
+        weighted.weight[s].max(price * interval.sigma[s] * interval.delta) < self.share
+    }
+}
+
+/// A sample of a chunk, and the cell of a stream's density grid that it is in.
+#[derive(Clone, Copy, Debug)]
+pub struct Placed {
+    /// Number of the sample in the chunk.
+    pub sample: u32,
+    /// Number of the cell.
+    pub cell: u32,
 }
 
 impl Chunk {
@@ -228,7 +259,7 @@ impl Chunk {
     ) {
         self.place(tracer, model, views, inputs, sampling);
         self.encode(model);
-        self.evaluate(simd, tracer, model, sampling.count);
+        self.evaluate(simd, tracer, model, sampling.count, Faint::default());
     }
 
     /// As [`Self::forward`], but densities and weights alone: colours and uncertainty are not computed.
@@ -242,21 +273,32 @@ impl Chunk {
         inputs: &[RayInput],
         sampling: &Sampling,
     ) {
-        let n = sampling.count;
         self.place(tracer, model, views, inputs, sampling);
         self.encode(model);
-        let Self { codes, rays, intervals, weighted, batches, samples, .. } = self;
-        for (s, samples) in samples.iter_mut().enumerate() {
+        self.find_densities(simd, tracer, model);
+        self.weigh(sampling.count);
+    }
+
+    /// Densities at all samples of the batches, and nothing else of the streams.
+    #[inline(always)]
+    fn find_densities<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model) {
+        let Self { codes, intervals, batches, .. } = self;
+        let Tracer { sigma, activations, .. } = tracer;
+        for s in 0..3 {
             let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
-            let sigma = &mut samples.sigma;
-            sigma.clear();
             sigma.resize(batches[s].len(), 0.0);
             let code = |r: usize| &codes[s][r * net.code..];
-            net.density(simd, &w, &batches[s], &mut tracer.activations[s], code, sigma);
-            for (&k, sigma) in batches[s].sample.iter().zip(sigma) {
+            net.density(simd, &w, &batches[s], &mut activations[s], code, sigma);
+            for (&k, sigma) in batches[s].sample.iter().zip(&*sigma) {
                 intervals[k as usize].sigma[s] = *sigma;
             }
         }
+    }
+
+    /// Weights of all samples, `n` a ray, by their densities.
+    #[inline(always)]
+    fn weigh(&mut self, n: usize) {
+        let Self { rays, intervals, weighted, .. } = self;
         weighted.resize(intervals.len(), Weighted::default());
         for (r, ray) in rays.iter_mut().enumerate() {
             let range = r * n..(r + 1) * n;
@@ -274,9 +316,30 @@ impl Chunk {
     }
 
     /// Evaluates the streams at the placed and encoded samples, `n` a ray, and composites.
+    ///
+    /// Where a stream is faint only its density is looked at, which is then done first: such samples leave its batch, and its
+    /// colour and uncertainty count as zero there.
     #[inline(always)]
-    pub fn evaluate<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, n: usize) {
-        let Self { codes, rays, intervals, weighted, batches, samples, .. } = self;
+    pub fn evaluate<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, n: usize, faint: Faint) {
+        if faint.share > 0.0 {
+            self.find_densities(simd, tracer, model);
+            self.weigh(n);
+            for (s, batch) in self.batches.iter_mut().enumerate() {
+                let (intervals, weighted) = (&self.intervals, &self.weighted);
+                batch.retain(|k| !faint.is(s, &intervals[k], &weighted[k]));
+            }
+        }
+        self.find_colours(simd, tracer, model);
+        if faint.share <= 0.0 {
+            self.weigh(n);
+        }
+        self.composite(n);
+    }
+
+    /// What the streams say at the samples of their batches.
+    #[inline(always)]
+    fn find_colours<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model) {
+        let Self { codes, rays, intervals, batches, samples, .. } = self;
         for s in 0..3 {
             samples[s].reset(intervals.len());
             let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
@@ -286,17 +349,20 @@ impl Chunk {
             let code = |r: usize| &codes[s][r * net.code..];
             let view = |r: usize| &rays[r].view[..];
             net.forward(simd, &w, &batches[s], &mut tracer.activations[s], code, view, &mut samples[s]);
-            for (i, sigma) in intervals.iter_mut().zip(&samples[s].sigma) {
-                i.sigma[s] = *sigma;
+            for &k in &batches[s].sample {
+                intervals[k as usize].sigma[s] = samples[s].sigma[k as usize];
             }
         }
-        weighted.resize(intervals.len(), Weighted::default());
+    }
+
+    /// Colours and uncertainties of the rays, of `n` samples each.
+    #[inline(always)]
+    fn composite(&mut self, n: usize) {
+        let Self { rays, weighted, samples, .. } = self;
         for (r, ray) in rays.iter_mut().enumerate() {
-            let range = r * n..(r + 1) * n;
-            ray.left = composite::weights(&intervals[range.clone()], &mut weighted[range.clone()]);
             ray.rgb = [0.0; 3];
             ray.beta = 0.0;
-            for k in range {
+            for k in r * n..(r + 1) * n {
                 for s in 0..3 {
                     let w = weighted[k].weight[s];
                     for c in 0..3 {
@@ -323,12 +389,13 @@ impl Chunk {
         let Tracer { sampler, edges, .. } = tracer;
         let n = sampling.count;
         let field = model.field;
-        let [grid_p, grid_d, grid_a] = &model.grids.streams;
+        let [_, grid_d, grid_a] = &model.grids.streams;
         self.rays.clear();
         self.intervals.clear();
         edges.resize(n + 1, 0.0);
-        for b in &mut self.batches {
-            b.clear();
+        for s in 0..3 {
+            self.batches[s].clear();
+            self.cells[s].clear();
         }
         for s in 0..3 {
             let width = field.nets[s].as_ref().map_or(0, |net| net.code);
@@ -356,23 +423,31 @@ impl Chunk {
                 let delta = edges[k + 1] - edges[k];
                 self.intervals.push(Interval { sigma: [0.0; 3], delta, t });
                 let p = ray.origin + ray.dir * t;
-                let threshold = &model.grids.threshold;
-                if model.streams[0] && grid_p.at(p, 0) >= threshold[0] {
-                    self.batches[0].push(sample, r, p, view.time);
+                if model.streams[0] {
+                    self.push(model, 0, [sample, r], p, view.time, 0);
                 }
-                if model.streams[1] && grid_d.at(p, slice_d) >= threshold[1] {
-                    self.batches[1].push(sample, r, p, view.time);
+                if model.streams[1] {
+                    self.push(model, 1, [sample, r], p, view.time, slice_d);
                 }
                 let z = t * input.dir_cam.z;
                 if model.streams[2] && z < field.actor_far {
-                    let q = model.actor_point(input.uv, z);
-                    if grid_a.at(q, slice_a) >= threshold[2] {
-                        self.batches[2].push(sample, r, q, view.time);
-                    }
+                    self.push(model, 2, [sample, r], model.actor_point(input.uv, z), view.time, slice_a);
                 }
             }
             let unit = ray.dir.normalize_or_zero();
             self.rays.push(TracedRay { ray, left: 1.0, rgb: [0.0; 3], beta: 0.0, view: view_encoding(unit) });
+        }
+    }
+
+    /// Has stream `s` evaluated at `p` and `time`, in slice `slice` of its density grid, unless the grid says that nothing is
+    /// there.
+    #[inline(always)]
+    fn push(&mut self, model: &Model, s: usize, [sample, ray]: [usize; 2], p: Vec3, time: f32, slice: usize) {
+        let grid = &model.grids.streams[s];
+        let cell = grid.index(p, slice);
+        if grid.sigma[cell] >= model.grids.threshold[s] {
+            self.batches[s].push(sample, ray, p, time);
+            self.cells[s].push(Placed { sample: sample as u32, cell: cell as u32 });
         }
     }
 }

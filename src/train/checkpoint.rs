@@ -45,6 +45,9 @@ pub struct TrainingState {
     pub finished: bool,
     /// Field evaluations, one stream each.
     pub evaluations: u64,
+    /// Of these, those of densities alone, because they gave too little light to be learned from.
+    #[serde(default)]
+    pub faint: u64,
     /// Evaluations there would have been at every placed sample for every stream.
     pub candidates: u64,
     /// Evaluations there would have been for the streams that the scene does not have.

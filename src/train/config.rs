@@ -68,6 +68,9 @@ pub struct TrainConfig {
     pub sharpness: f32,
     /// Fraction of the schedule after which a stream is not evaluated where its grid is empty.
     pub skip_from: f64,
+    /// Share of its pixel's light below which nothing is learned from what a stream is at a sample, nor its colour looked at,
+    /// from `skip_from` on, unless `loss.transient` weighs more than that; 0: everything counts.
+    pub faint: f32,
     /// Share of a ray's samples spread evenly at the start, and at the end of the schedule.
     pub explore: [f32; 2],
     /// What the networks are multiplied in while training.
@@ -79,7 +82,7 @@ pub struct TrainConfig {
 impl Default for TrainConfig {
     fn default() -> Self {
         Self {
-            steps: 4200,
+            steps: 5000,
             rays: 4096,
             patch: 4,
             samples: 20,
@@ -102,6 +105,7 @@ impl Default for TrainConfig {
             grid_rate: 0.05,
             sharpness: 0.3,
             skip_from: 0.1,
+            faint: 1e-4,
             explore: [0.5, 0.1],
             precision: Precision::Auto,
             checkpoint_seconds: 60.0,

@@ -106,6 +106,8 @@ pub struct ChunkGradient {
     pub asked: Vec<[f32; 3]>,
     /// With respect to the disparity of each ray.
     disparity: Vec<f32>,
+    /// Whether things move where the samples of a ray are.
+    moving: Vec<bool>,
 }
 
 /// The colour that a ray should have, and how it was exposed.
@@ -148,7 +150,7 @@ pub fn backward(
     grad.sigma.resize(total, [0.0; 3]);
     grad.exposure.resize(targets.len(), [0.0; 6]);
     for s in &mut grad.samples {
-        s.reset(total);
+        s.resize(total);
     }
     let bent = flatness::backward(config.flatness, chunk, bends, count, scale, &mut grad.disparity);
     let mut loss = ChunkLoss { total: f64::from(bent), ..ChunkLoss::default() };
@@ -180,8 +182,11 @@ pub fn backward(
         let cover = covers(&chunk.weighted[range.clone()]);
         let veil = [0.0, 1.0, 1.0].map(|v| v * config.veil);
         extra += (0..3).map(|s| veil[s] * cover[s] * (1.0 - cover[s])).sum::<f32>();
+        // All of them first: these reads are from all over memory, and so do not wait for one another.
+        grad.moving.clear();
+        grad.moving.extend(chunk.intervals[range.clone()].iter().map(|i| moving.contains(ray.ray.at(i.t))));
         for k in range.clone() {
-            let prices = config.prices(moving.contains(ray.ray.at(chunk.intervals[k].t)));
+            let prices = config.prices(grad.moving[k - range.start]);
             for s in 0..3 {
                 let w = chunk.weighted[k].weight[s];
                 let rgb = chunk.samples[s].rgb[k];

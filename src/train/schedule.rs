@@ -37,6 +37,8 @@ impl TrainConfig {
                 explore: self.explore[0] + (self.explore[1] - self.explore[0]) * settled,
                 sharpness: self.sharpness,
             },
+            // Before that the streams are fog, all of which has to be looked at.
+            faint: if progress >= self.skip_from { self.faint } else { 0.0 },
             time_spread: self.time_spread,
             table_rate: self.table_rate * rate,
             network_rate: network_rate * rate,

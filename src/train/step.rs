@@ -31,11 +31,13 @@ mod reference;
 mod seed_tests;
 mod update;
 
-/// Groups that a step is divided into; fixed, so that sums are taken in the same order on any machine.
+/// Groups that a step is divided into, unless it has fewer chunks; whatever the number of threads, so that sums are taken in
+/// the same order on any machine.
 const GROUPS: usize = 16;
 
-/// Rays whose activations are kept together: 32 × 24 samples are 1.2 MB, within one core's L2.
-pub const CHUNK_RAYS: usize = 32;
+/// Rays whose activations are kept together: of 64 × 20 samples some two thirds are not faint, 1.5 MB, within one core's
+/// L2. More of them share the sums at the end of a chunk, and fill the tiles of streams that are evaluated here and there.
+pub const CHUNK_RAYS: usize = 64;
 
 /// Random numbers from here down are those of the frames' times.
 const TIMES: u64 = u64::MAX / 2;
@@ -53,6 +55,8 @@ pub struct StepPlan {
     pub grid_rate: f32,
     /// Where samples go.
     pub sampling: Sampling,
+    /// See [`crate::train::TrainConfig::faint`].
+    pub faint: f32,
     /// See [`crate::train::TrainConfig::time_spread`].
     pub time_spread: f32,
     /// Learning rate of the tables.
@@ -80,9 +84,10 @@ pub trait Companion: Sync {
     fn ask(&self, chunk: usize, traced: &Chunk, weight: &mut [[f32; 3]]);
 }
 
-/// Chunks of a step of `rays` rays.
+/// Chunks of a step of `rays` rays, as many in every group.
 pub fn chunks(rays: usize) -> usize {
-    rays.div_ceil(CHUNK_RAYS * GROUPS) * GROUPS
+    let needed = rays.div_ceil(CHUNK_RAYS);
+    needed.next_multiple_of(needed.clamp(1, GROUPS))
 }
 
 /// What a step did.
@@ -96,6 +101,8 @@ pub struct StepReport {
     pub rays: usize,
     /// Field evaluations, one stream each.
     pub evaluations: usize,
+    /// Of them those that gave too little light for their colour to be looked at and for anything to be learned from them.
+    pub faint: usize,
     /// Samples placed, times streams: what would have been evaluated without occupancy.
     pub candidates: usize,
     /// Samples placed, times streams that the field does not have.
@@ -124,7 +131,7 @@ impl Optimiser {
         Self {
             dense: Moments::new(field.layout.len),
             tables: field.tables.each_ref().map(|t| t.iter().map(|t| TableState::new(t.len())).collect()),
-            groups: (0..GROUPS).map(|_| Group::default()).collect(),
+            groups: Vec::new(),
             gradient: vec![0.0; field.layout.len],
         }
     }
@@ -151,8 +158,10 @@ impl Optimiser {
         seed: u64,
         companion: Option<&dyn Companion>,
     ) -> StepReport {
-        let chunks = chunks(plan.rays) / GROUPS;
-        let rays = chunks * CHUNK_RAYS * GROUPS;
+        let chunks = chunks(plan.rays);
+        let rays = chunks * CHUNK_RAYS;
+        self.groups.resize_with(chunks.min(GROUPS), Group::default);
+        let chunks = chunks / self.groups.len().max(1);
         let mut views: Vec<View> = pixels.frames.iter().map(|f| View::new(field, f)).collect();
         for (n, view) in views.iter_mut().enumerate() {
             let mut rng = Rng::new(seed, plan.step, TIMES - n as u64);
@@ -174,6 +183,7 @@ impl Optimiser {
             report.loss += g.loss.total / rays as f64;
             report.squared += g.loss.squared / rays as f64;
             report.evaluations += g.evaluations;
+            report.faint += g.faint;
             report.spared += g.spared;
             report.diverged = report.diverged.or(g.diverged);
         }
@@ -181,9 +191,9 @@ impl Optimiser {
         report.candidates = rays * plan.sampling.count * live;
         report.absent = rays * plan.sampling.count * field.nets.iter().filter(|net| net.is_none()).count();
         if plan.pose_rate == 0.0 && plan.rig_rate == 0.0 {
-            report.unrefined = report.evaluations / group::REFINE_EVERY as usize;
+            report.unrefined = (report.evaluations - report.faint) / group::REFINE_EVERY as usize;
         }
-        update(self, field, grids, &views, plan);
+        update(self, field, grids, plan);
         report
     }
 }

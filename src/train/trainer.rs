@@ -267,6 +267,7 @@ impl Trainer {
         let progress = &mut self.trained.progress;
         progress.rays += report.rays as u64;
         progress.evaluations += report.evaluations as u64;
+        progress.faint += report.faint as u64;
         progress.candidates += report.candidates as u64;
         progress.absent += report.absent as u64;
         progress.spared += report.spared;

@@ -159,9 +159,25 @@ impl Mlp {
     /// From the input rows of tile `n` to its output rows.
     #[inline(always)]
     pub fn forward<S: Simd>(&self, simd: S, unit: &Unit, packed: &Packed, a: &mut Activations, n: usize) {
+        self.forward_first(simd, unit, packed, a, n, self.output());
+    }
+
+    /// As [`Self::forward`], but of the output only the first `outputs` rows need be filled.
+    #[inline(always)]
+    pub fn forward_first<S: Simd>(
+        &self,
+        simd: S,
+        unit: &Unit,
+        packed: &Packed,
+        a: &mut Activations,
+        n: usize,
+        outputs: usize,
+    ) {
         let tile = &mut a.values[n * a.stride..][..a.end];
         match packed {
-            Packed::Vector(packed) => packed.forward(simd, &self.layers, tile),
+            Packed::Vector(packed) => {
+                packed.forward(simd, &self.layers, tile, outputs.next_multiple_of(BLOCK));
+            }
             Packed::Matrix(packed) => packed.forward(unit, &self.layers, tile, &mut a.saved, n),
         }
     }

@@ -35,17 +35,19 @@ impl Packed {
         packed
     }
 
-    /// Fills all rows below the input of one tile, `[rows][TILE]`.
+    /// Fills all rows below the input of one tile, `[rows][TILE]`; of the output the first `outputs` (a multiple of
+    /// [`BLOCK`]).
     #[inline(always)]
-    pub(super) fn forward<S: Simd>(&self, simd: S, layers: &[Layer], tile: &mut [f32]) {
+    pub(super) fn forward<S: Simd>(&self, simd: S, layers: &[Layer], tile: &mut [f32], outputs: usize) {
         for (n, layer) in layers.iter().enumerate() {
+            let n_out = if n + 1 < layers.len() { layer.n_out } else { outputs };
             if layer.again > 0 {
                 tile.copy_within(..layer.again * TILE, (layer.row + layer.fresh()) * TILE);
             }
             let (x, y) = tile[layer.row * TILE..].split_at_mut(layer.n_in * TILE);
-            let w = &self.forward[layer.weight..][..layer.weights()];
-            let bias = &self.bias[layer.bias..][..layer.n_out];
-            matmul(simd, w, bias, x, &mut y[..layer.n_out * TILE], n + 1 < layers.len());
+            let w = &self.forward[layer.weight..][..layer.n_in * n_out];
+            let bias = &self.bias[layer.bias..][..n_out];
+            matmul(simd, w, bias, x, &mut y[..n_out * TILE], n + 1 < layers.len());
         }
     }
 
@@ -92,8 +94,9 @@ pub(super) fn accumulate<S: Simd>(
             for i in (0..layer.n_in).step_by(BLOCK) {
                 let block = outer_product(simd, dy.rows(o), x.rows(i), count);
                 for (j, row) in block.iter().enumerate() {
-                    for (k, v) in row.iter().enumerate() {
-                        gw[(o + j) * layer.n_in + i + k] += v;
+                    let at = (o + j) * layer.n_in + i;
+                    for (g, v) in gw[at..at + BLOCK].iter_mut().zip(row) {
+                        *g += v;
                     }
                 }
             }

@@ -25,6 +25,7 @@ fn random(seed: u64) -> (Trained, Optimiser) {
         seconds: 0.1,
         finished: false,
         evaluations: 3,
+        faint: 2,
         candidates: 4,
         absent: 6,
         spared: 7,

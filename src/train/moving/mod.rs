@@ -143,7 +143,7 @@ impl Volume {
         if self.bits.is_empty() || !p.cmpge(Vec3::ZERO).all() {
             return None;
         }
-        let c = (p / self.cell).as_uvec3();
+        let c = (p * (1.0 / self.cell)).as_uvec3();
         let at =
             || ((c.z as usize * self.size.y as usize + c.y as usize) * self.size.x as usize) + c.x as usize;
         c.cmplt(self.size).all().then(at)

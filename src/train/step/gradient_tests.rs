@@ -47,7 +47,25 @@ pub(super) enum Place {
 
 /// Traces one chunk of a field whose numbers are all random, with holes in its density grids.
 pub(super) fn trace(seed: u64) -> Traced {
-    trace_with(EncodingKind::Hash, seed, Precision::F32, weighed())
+    trace_with(seed, Setting::default())
+}
+
+/// What is traced, and how.
+#[derive(Clone)]
+struct Setting {
+    encoding: EncodingKind,
+    precision: Precision,
+    faint: f32,
+    /// Added to all raw densities.
+    denser: f32,
+    config: LossConfig,
+}
+
+impl Default for Setting {
+    fn default() -> Self {
+        let (encoding, precision) = (EncodingKind::Hash, Precision::F32);
+        Self { encoding, precision, faint: 0.0, denser: 0.0, config: weighed() }
+    }
 }
 
 /// Weights large enough that one per cent of a term is more than the tolerance.
@@ -74,7 +92,8 @@ fn seeds() -> impl Iterator<Item = u64> {
     (1..).filter(sees_all)
 }
 
-fn trace_with(encoding: EncodingKind, seed: u64, precision: Precision, config: LossConfig) -> Traced {
+fn trace_with(seed: u64, setting: Setting) -> Traced {
+    let Setting { encoding, precision, faint, denser, config } = setting;
     let folder = tempfile::tempdir().expect("a temporary folder");
     let mut pixels =
         PixelSet::load(testing::frames(folder.path()), 2.0, 0.5).expect("frames that were just written");
@@ -84,6 +103,9 @@ fn trace_with(encoding: EncodingKind, seed: u64, precision: Precision, config: L
     let mut rng = Rng::new(seed, 1, 0);
     for row in field.tables.iter_mut().flatten().flatten() {
         *row = Row::from_slice(&testing::noise(&mut rng, FEATURES, 0.5));
+    }
+    for net in field.nets.iter_mut().flatten() {
+        net.density_bias += denser;
     }
     let layout = field.layout.clone();
     let mut shake = |range: Range<usize>, size: f32| {
@@ -119,6 +141,7 @@ fn trace_with(encoding: EncodingKind, seed: u64, precision: Precision, config: L
     // Every fourth chunk refines poses: the first one does at a step that is a multiple of four.
     let mut plan = settings.train.plan(settings.field.encoding, 4, 0.5, [true; 3]);
     plan.precision = precision;
+    plan.faint = faint;
     // Patches that have rows of three, and as many of them as fit into a chunk.
     plan.patch = 3;
     plan.pose_rate = 1.0;
@@ -245,6 +268,13 @@ impl Traced {
             Place::Weights => &self.dense[range],
         }
     }
+
+    /// How far a group's gradient is from another one, as a share of the length of that one.
+    fn off(&self, other: &Self, place: Place, range: Range<usize>) -> f64 {
+        let length = |v: &mut dyn Iterator<Item = f32>| v.map(|v| f64::from(v).powi(2)).sum::<f64>().sqrt();
+        let (a, b) = (self.gradient(place, range.clone()), other.gradient(place, range));
+        length(&mut a.iter().zip(b).map(|(a, b)| a - b)) / length(&mut b.iter().copied())
+    }
 }
 
 /// Ranges of every layer's weights and biases.
@@ -339,7 +369,7 @@ fn every_gradient_matches_finite_differences() {
 fn every_gradient_of_the_other_encodings_matches_finite_differences() {
     let seed = seeds().next().expect("there is one");
     for encoding in [EncodingKind::Dense, EncodingKind::Frequency] {
-        check(&trace_with(encoding, seed, Precision::F32, weighed()), seed);
+        check(&trace_with(seed, Setting { encoding, ..Setting::default() }), seed);
     }
 }
 
@@ -348,7 +378,7 @@ fn every_gradient_of_the_other_encodings_matches_finite_differences() {
 #[should_panic(expected = "finite difference")]
 fn frequencies_that_are_off_by_one_per_cent_are_found() {
     let seed = seeds().next().expect("there is one");
-    let mut traced = trace_with(EncodingKind::Frequency, seed, Precision::F32, weighed());
+    let mut traced = trace_with(seed, Setting { encoding: EncodingKind::Frequency, ..Setting::default() });
     for net in traced.field.nets.iter_mut().flatten() {
         for level in &mut net.encoding.levels {
             if let Level::Waves { half_turns, .. } = level {
@@ -447,17 +477,38 @@ fn bf16_gradients_agree_with_f32_ones() {
     for seed in seeds().take(3) {
         // Bends are differences of rounded numbers: at the weight that training gives them.
         let config = LossConfig { flatness: LossConfig::default().flatness, transient: 0.1, ..weighed() };
+        let setting = Setting { config, ..Setting::default() };
         let [exact, rounded] = [Precision::F32, Precision::Bf16]
-            .map(|p| trace_with(EncodingKind::Hash, seed, p, config.clone()));
+            .map(|precision| trace_with(seed, Setting { precision, ..setting.clone() }));
         assert!((exact.loss - rounded.loss).abs() < 1e-2 * exact.loss.abs());
         for (name, place, range) in exact.groups() {
-            let (a, b) = (exact.gradient(place, range.clone()), rounded.gradient(place, range.clone()));
-            let norm = |v: &mut dyn Iterator<Item = f32>| v.map(|v| f64::from(v).powi(2)).sum::<f64>().sqrt();
-            let size = norm(&mut a.iter().copied());
-            let error = norm(&mut a.iter().zip(b).map(|(a, b)| a - b));
             let camera = range.start >= exact.field.layout.exposure.start;
             let bound = if matches!(place, Place::Weights) && camera { 0.5 } else { 0.15 };
-            assert!(error < bound * size, "seed {seed}, {name}: off by {error:e} of {size:e}");
+            let off = rounded.off(&exact, place, range);
+            assert!(off < bound, "seed {seed}, {name}: off by {off:e} of its length");
+        }
+    }
+}
+
+/// What a sample gives to its pixel is what it learns from it.
+#[test]
+fn faint_samples_teach_next_to_nothing() {
+    for seed in seeds().take(3) {
+        // So dense that little light is left behind the first samples.
+        let [all, bright] =
+            [0.0, 1e-4].map(|faint| trace_with(seed, Setting { faint, denser: 4.0, ..Setting::default() }));
+        let [before, after] = [&all, &bright].map(|t| t.chunk.traced.batches.each_ref().map(|b| b.len()));
+        let fewer = after.iter().sum::<usize>() < before.iter().sum();
+        assert!(fewer && after.iter().all(|n| *n > 0), "{before:?} → {after:?}");
+        let placed = |t: &Traced| t.chunk.traced.cells.each_ref().map(Vec::len);
+        assert_eq!((placed(&all), placed(&bright)), (before, before), "densities are looked at everywhere");
+        for (a, b) in all.chunk.traced.weighted.iter().zip(&bright.chunk.traced.weighted) {
+            assert_eq!((a.weight, a.transmittance), (b.weight, b.transmittance));
+        }
+        assert!((all.loss - bright.loss).abs() < 1e-2 * all.loss.abs());
+        for (name, place, range) in all.groups() {
+            let off = bright.off(&all, place, range);
+            assert!(off < 0.05, "seed {seed}, {name}: off by {off:e} of its length");
         }
     }
 }

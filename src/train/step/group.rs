@@ -6,7 +6,7 @@ use pulp::Simd;
 use super::{CHUNK_RAYS, Companion, StepPlan};
 use crate::field::stream::StreamBatch;
 use crate::render::density_grid::DensityGrid;
-use crate::render::forward::{Chunk, Model, RayInput, Tracer};
+use crate::render::forward::{Chunk, Faint, Model, RayInput, Tracer};
 use crate::render::rays::View;
 use crate::rng::Rng;
 use crate::simd::TILE;
@@ -63,6 +63,8 @@ pub struct Group {
     /// Number of the first chunk whose loss is not finite.
     pub diverged: Option<usize>,
     pub evaluations: usize,
+    /// Those of them that gave too little light to be learned from.
+    pub faint: usize,
     /// Steps through the density grids that its rays were spared.
     pub spared: u64,
 }
@@ -94,16 +96,20 @@ impl Group {
     /// Evaluates the encoded samples and goes all the way back to their encodings.
     #[inline(always)]
     pub fn evaluate<S: Simd>(&mut self, simd: S, context: &Context) {
-        let Self { chunks, first, refresh, tracer, gradient, dense, loss, diverged, evaluations, .. } = self;
+        let Self {
+            chunks, first, refresh, tracer, gradient, dense, loss, diverged, evaluations, faint, ..
+        } = self;
         dense.clear();
         dense.resize(context.model.field.layout.len, 0.0);
-        (*loss, *diverged, *evaluations) = (ChunkLoss::default(), None, 0);
+        (*loss, *diverged, *evaluations, *faint) = (ChunkLoss::default(), None, 0, 0);
         for (number, chunk) in (*first..).zip(chunks) {
             let l = chunk.evaluate(simd, context, tracer, gradient, number);
             loss.total += l.total;
             loss.squared += l.squared;
             *diverged = diverged.or((!l.total.is_finite()).then_some(number));
-            *evaluations += chunk.traced.batches.iter().map(StreamBatch::len).sum::<usize>();
+            let placed: usize = chunk.traced.cells.iter().map(Vec::len).sum();
+            *evaluations += placed;
+            *faint += placed - chunk.traced.batches.iter().map(StreamBatch::len).sum::<usize>();
             chunk.backward(simd, context, tracer, gradient, dense);
         }
         for (s, refresh) in refresh.iter_mut().enumerate() {
@@ -112,24 +118,19 @@ impl Group {
     }
 
     /// Tells the density grid of stream `s` what densities were seen.
-    pub fn tell(&self, s: usize, views: &[View], grid: &mut DensityGrid, rate: f32) {
-        for chunk in &self.chunks {
-            let traced = &chunk.traced;
-            // All samples of a ray share its time.
-            let count = traced.intervals.len() / chunk.inputs.len().max(1);
-            let slice = |k: usize| grid.slice(views[chunk.inputs[k / count].view as usize].time);
-            let slices: Vec<usize> = (0..traced.intervals.len()).step_by(count.max(1)).map(slice).collect();
-            for (k, p) in traced.batches[s].points() {
-                grid.observe(p, slices[k / count], traced.samples[s].sigma[k], rate);
+    pub fn tell(&self, s: usize, grid: &mut DensityGrid, rate: f32) {
+        for Chunk { cells, intervals, .. } in self.chunks.iter().map(|c| &c.traced) {
+            for at in &cells[s] {
+                grid.observe(at.cell as usize, intervals[at.sample as usize].sigma[s], rate);
             }
         }
     }
 
     /// Tells the density grid of stream `s` what its random cells hold.
     pub fn tell_refreshed(&self, s: usize, grid: &mut DensityGrid) {
-        let Refresh { batch, slices, sigma, .. } = &self.refresh[s];
-        for (k, p) in batch.points() {
-            grid.observe(p, slices[k], sigma[k], REFRESH_RATE);
+        let Refresh { cells, sigma, .. } = &self.refresh[s];
+        for (cell, sigma) in cells.iter().zip(sigma) {
+            grid.observe(*cell, *sigma, REFRESH_RATE);
         }
     }
 }
@@ -222,7 +223,8 @@ impl TrainChunk {
         number: usize,
     ) -> ChunkLoss {
         let count = context.plan.sampling.count;
-        self.traced.evaluate(simd, tracer, context.model, count);
+        let faint = Faint { share: context.plan.faint, transient: context.config.transient };
+        self.traced.evaluate(simd, tracer, context.model, count, faint);
         gradient.asked.clear();
         if let Some(companion) = context.companion {
             gradient.asked.resize(self.traced.intervals.len(), [0.0; 3]);
@@ -305,7 +307,7 @@ impl TrainChunk {
 struct Refresh {
     batch: StreamBatch,
     codes: Vec<f32>,
-    slices: Vec<usize>,
+    cells: Vec<usize>,
     sigma: Vec<f32>,
 }
 
@@ -313,7 +315,7 @@ impl Refresh {
     fn place(&mut self, context: &Context, s: usize, rng: &mut Rng) {
         let field = context.model.field;
         self.batch.clear();
-        self.slices.clear();
+        self.cells.clear();
         let (true, Some(net)) = (context.plan.streams[s], &field.nets[s]) else { return };
         let grid = &context.model.grids.streams[s];
         self.codes.resize(REFRESH_CELLS * net.code, 0.0);
@@ -322,7 +324,7 @@ impl Refresh {
             let u = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform());
             let (p, time) = grid.point(cell, u, rng.uniform());
             self.batch.push(k, k, p, time);
-            self.slices.push(grid.slice(time));
+            self.cells.push(cell);
             if let Some(code) = &field.codes[s] {
                 let gamma = &field.weights[field.layout.streams[s].code.clone()];
                 code.evaluate(gamma, code.locate(time), &mut self.codes[k * net.code..][..net.code]);

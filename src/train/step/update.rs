@@ -5,18 +5,11 @@ use std::ops::Range;
 use super::{Optimiser, StepPlan};
 use crate::field::Field;
 use crate::render::forward::Grids;
-use crate::render::rays::View;
 use crate::train::adam::{self, Moments, StepSize};
 use crate::train::table_pass::TablePass;
 
 /// Updates everything that is learned, and the density grids.
-pub fn update(
-    optimiser: &mut Optimiser,
-    field: &mut Field,
-    grids: &mut Grids,
-    views: &[View],
-    plan: &StepPlan,
-) {
+pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, plan: &StepPlan) {
     let Optimiser { dense, tables, groups, gradient } = optimiser;
     let groups = &groups[..];
     let arch = pulp::Arch::new();
@@ -35,7 +28,7 @@ pub fn update(
         }
         for (s, grid) in grids.streams.iter_mut().enumerate().filter(|(s, _)| plan.streams[*s]) {
             scope.spawn(move |_| {
-                groups.iter().for_each(|group| group.tell(s, views, grid, plan.grid_rate));
+                groups.iter().for_each(|group| group.tell(s, grid, plan.grid_rate));
                 groups.iter().for_each(|group| group.tell_refreshed(s, grid));
             });
         }

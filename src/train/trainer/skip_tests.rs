@@ -5,16 +5,21 @@ use crate::render::image::RenderedFrame;
 use crate::render::sampler::Sampling;
 use crate::train::testing;
 
-/// A field that learned the wall, with cells in which a stream is skipped.
-fn trained(folder: &Path) -> (Scene, Trainer) {
-    let scene = testing::scene(folder);
+/// Settings of a short training in which streams are skipped.
+fn settings() -> Config {
     let mut config = testing::config();
     config.train.steps = 200;
     config.train.streams = StreamChoice::All;
     config.train.static_until = 0.2;
     config.train.stereo_at = 1.0;
     config.train.skip_from = 0.3;
-    let mut trainer = Trainer::new(&scene, &config).expect("the test's scene is valid");
+    config
+}
+
+/// A field that learned the wall, with cells in which a stream is skipped.
+fn trained(folder: &Path) -> (Scene, Trainer) {
+    let scene = testing::scene(folder);
+    let mut trainer = Trainer::new(&scene, &settings()).expect("the test's scene is valid");
     let run = tempfile::tempdir().expect("a temporary folder");
     trainer.run(run.path(), None, &mut |_| ControlFlow::Continue(())).expect("training goes through");
     (scene, trainer)
@@ -97,4 +102,36 @@ fn poses_that_are_exact_cost_nothing_and_change_nothing_else() {
         (field.weights.clone(), field.tables.clone())
     };
     assert!(step(true) == step(false), "the way back to the poses changed the field");
+}
+
+#[test]
+fn a_training_without_faint_samples_learns_the_same() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    let learn = |faint: f32| {
+        let mut config = settings();
+        config.train.faint = faint;
+        let mut trainer = Trainer::new(&scene, &config).expect("the test's scene is valid");
+        let run = tempfile::tempdir().expect("a temporary folder");
+        trainer.run(run.path(), None, &mut |_| ControlFlow::Continue(())).expect("training goes through");
+        let Trained { field, grids, progress } = trainer.into_trained();
+        let off: Vec<f64> = scene
+            .frames
+            .iter()
+            .flat_map(|frame| {
+                let seen = frame.load_rgb().expect("the test's pictures can be read").pixels;
+                let shown = picture(&field, &grids, [true; 3], frame).rgb;
+                seen.into_iter().zip(shown).flat_map(|(a, b)| {
+                    (0..3)
+                        .map(move |c| (f64::from(a[c]) / 255.0 - f64::from(b[c])).powi(2))
+                        .collect::<Vec<_>>()
+                })
+            })
+            .collect();
+        (psnr(off.iter().sum::<f64>() / off.len() as f64), progress)
+    };
+    let ((all, everything), (bright, progress)) = (learn(0.0), learn(1e-4));
+    assert_eq!(everything.faint, 0);
+    assert!(progress.faint > progress.evaluations / 100, "{progress:?}");
+    assert!(bright > all - 0.5, "{all} dB with faint samples, {bright} dB without");
 }
