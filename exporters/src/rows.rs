@@ -8,6 +8,9 @@ use rayon::prelude::*;
 /// other passes over them; from the second level, forty columns take four times as long.
 pub(crate) const CHUNK_BYTES: usize = 16 * 1024;
 
+/// Chunks but for the last have a multiple of so many rows, for packers that take some at once.
+const ROWS_AT_ONCE: usize = 4;
+
 /// Bytes handed to the system at a time, for each thread that packs them.
 const BATCH_BYTES: usize = 1 << 20;
 
@@ -23,7 +26,7 @@ pub(crate) fn write_rows(
     stride: usize,
     pack: impl Fn(usize, &mut [u8]) + Sync,
 ) -> io::Result<()> {
-    let rows_per_chunk = (CHUNK_BYTES / stride).max(1);
+    let rows_per_chunk = (CHUNK_BYTES / stride).next_multiple_of(ROWS_AT_ONCE).max(ROWS_AT_ONCE);
     let chunks_per_batch = (BATCH_BYTES / CHUNK_BYTES) * rayon::current_num_threads();
     let rows_per_batch = rows_per_chunk * chunks_per_batch;
     let pack_batch = |first_row: usize, batch: &mut Vec<u8>| {
@@ -34,14 +37,17 @@ pub(crate) fn write_rows(
             .for_each(|(chunk, bytes)| pack(first_row + chunk * rows_per_chunk, bytes));
     };
     let (mut packed, mut next) = (Vec::new(), Vec::new());
-    pack_batch(0, &mut packed);
-    for first_row in (0..rows).step_by(rows_per_batch) {
-        let (written, ()) =
-            rayon::join(|| file.write_all(&packed), || pack_batch(first_row + rows_per_batch, &mut next));
-        written?;
-        std::mem::swap(&mut packed, &mut next);
-    }
-    Ok(())
+    // On one of the pool's threads: from outside, both sides of each `join` would wait for one to wake up.
+    rayon::scope(|_| {
+        pack_batch(0, &mut packed);
+        for first_row in (0..rows).step_by(rows_per_batch) {
+            let (written, ()) =
+                rayon::join(|| file.write_all(&packed), || pack_batch(first_row + rows_per_batch, &mut next));
+            written?;
+            std::mem::swap(&mut packed, &mut next);
+        }
+        Ok(())
+    })
 }
 
 /// [`write_rows`] with one item a row.

@@ -27,7 +27,16 @@ impl Geometry {
     pub fn validate(&self) -> Result<()> {
         self.validate_shapes()?;
         self.validate_names()?;
-        self.validate_numbers()?;
+        self.validate_offset()?;
+        self.validate_columns()?;
+        self.validate_triangles()
+    }
+
+    /// [`Self::validate`] but for the numbers in the columns of vertices.
+    pub(crate) fn validate_all_but_columns(&self) -> Result<()> {
+        self.validate_shapes()?;
+        self.validate_names()?;
+        self.validate_offset()?;
         self.validate_triangles()
     }
 
@@ -92,10 +101,14 @@ impl Geometry {
         Ok(())
     }
 
-    fn validate_numbers(&self) -> Result<()> {
-        if let Some(axis) = self.offset.iter().position(|value| !value.is_finite()) {
-            return Err(self.non_finite("offset", axis, self.offset[axis]));
+    fn validate_offset(&self) -> Result<()> {
+        match self.offset.iter().position(|value| !value.is_finite()) {
+            Some(axis) => Err(self.non_finite("offset", axis, self.offset[axis])),
+            None => Ok(()),
         }
+    }
+
+    fn validate_columns(&self) -> Result<()> {
         self.check_finite("positions", self.positions.as_flattened(), 3)?;
         self.check_finite("normals", self.normals.as_flattened(), 3)?;
         for attribute in &self.attributes {
@@ -106,12 +119,7 @@ impl Geometry {
         for features in &self.features {
             self.check_finite(&features.name, &features.values, features.dim)?;
         }
-        let not_unit = |normal: &[f32; 3]| {
-            let [x, y, z] = normal;
-            let length = (x * x + y * y + z * z).sqrt();
-            (length - 1.0).abs() > UNIT_LENGTH_TOLERANCE
-        };
-        match position_of_first(&self.normals, not_unit) {
+        match position_of_first(&self.normals, is_not_unit) {
             Some(vertex) => {
                 let reason = format!(
                     "the normal of vertex {vertex}, {:?}, is not of unit length",
@@ -173,18 +181,32 @@ impl Features {
 
 /// Index of the first NaN or infinity.
 pub(crate) fn first_non_finite(values: &[f32]) -> Option<usize> {
-    position_of_first(values, |value| !value.is_finite())
+    position_of_first(values, is_non_finite)
+}
+
+pub(crate) fn is_non_finite(value: &f32) -> bool {
+    !value.is_finite()
+}
+
+pub(crate) fn is_not_unit(normal: &[f32; 3]) -> bool {
+    let [x, y, z] = normal;
+    let length = (x * x + y * y + z * z).sqrt();
+    (length - 1.0).abs() > UNIT_LENGTH_TOLERANCE
 }
 
 /// Index of the first item that is bad.
 pub(crate) fn position_of_first<T: Sync>(items: &[T], is_bad: impl Fn(&T) -> bool + Sync) -> Option<usize> {
     items.par_chunks(CHUNK).enumerate().find_map_first(|(chunk, items)| {
-        // Looking at every item of a chunk vectorises, stopping at the first bad one does not.
-        if !items.iter().fold(false, |any, item| any | is_bad(item)) {
+        if !any(items, &is_bad) {
             return None;
         }
         items.iter().position(&is_bad).map(|index| chunk * CHUNK + index)
     })
+}
+
+/// Whether any item is bad. Looking at every item vectorises, stopping at the first bad one does not.
+pub(crate) fn any<T>(items: &[T], is_bad: impl Fn(&T) -> bool) -> bool {
+    items.iter().fold(false, |any, item| any | is_bad(item))
 }
 
 /// What CloudCompare wants extra columns to start with.

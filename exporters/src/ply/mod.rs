@@ -4,6 +4,7 @@
 //! `comment divff name <name>`, `comment divff offset <x> <y> <z>`, `comment divff quality <attribute>`.
 
 mod body;
+mod columns;
 mod header;
 mod layout;
 mod matrix;

@@ -8,7 +8,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::error::Error;
-use crate::geometry::{AttributeValues, Features};
+use crate::geometry::{Attribute, AttributeValues, Features};
 use crate::samples::*;
 
 fn temp_file(name: &str) -> (tempfile::TempDir, PathBuf) {
@@ -204,4 +204,63 @@ fn a_refused_geometry_leaves_the_old_file() {
     assert!(write_ply(&path, &tetrahedron(), &unknown).unwrap_err().to_string().contains("beauty"));
     assert_eq!(fs::read_to_string(&path).unwrap(), "old");
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+}
+
+/// Values are looked at as they are packed; what is told of them is what a look before that finds.
+#[test]
+fn what_is_refused_is_what_validation_finds_first() {
+    let (folder, path) = temp_file("a.ply");
+    let vertices = 20_000;
+    let valid = crate::Geometry {
+        name: "points".into(),
+        positions: vec![[1.0; 3]; vertices],
+        normals: vec![[0.0, 0.0, 1.0]; vertices],
+        attributes: vec![
+            float_attribute("wash", vertices),
+            float_attribute("cook", vertices),
+            float_attribute("sit", vertices),
+            float_attribute("open", vertices),
+            float_attribute("cut", vertices),
+        ],
+        features: vec![Features { name: "clip".into(), dim: 3, values: vec![0.5; 3 * vertices] }],
+        ..Default::default()
+    };
+    write_ply(&path, &valid, &PlyOptions::default()).unwrap();
+    fs::write(&path, "old").unwrap();
+    let breaks: [fn(&mut crate::Geometry); 8] = [
+        |g| g.positions[19_999][2] = f32::NAN,
+        |g| g.normals[12_345][0] = f32::INFINITY,
+        |g| g.normals[7] = [0.0, 0.0, 1.1],
+        |g| float_values(&mut g.attributes[0])[19_998] = f32::NEG_INFINITY,
+        |g| float_values(&mut g.attributes[4])[3] = f32::NAN,
+        |g| g.features[0].values[59_999] = f32::NAN,
+        |g| g.offset[0] = f64::NAN,
+        |g| g.triangles = vec![[0, 1, 20_000]],
+    ];
+    let unknown = PlyOptions { quality: Some("beauty".into()), ..PlyOptions::default() };
+    let nowhere = folder.path().join("nowhere").join("a.ply");
+    for (i, first) in breaks.iter().enumerate() {
+        for second in &breaks[i..] {
+            let mut broken = valid.clone();
+            second(&mut broken);
+            first(&mut broken);
+            let expected = broken.validate().unwrap_err().to_string();
+            for (path, options) in
+                [(&path, &PlyOptions::default()), (&path, &unknown), (&nowhere, &PlyOptions::default())]
+            {
+                assert_eq!(write_ply(path, &broken, options).unwrap_err().to_string(), expected);
+            }
+        }
+    }
+    assert_eq!(fs::read_to_string(&path).unwrap(), "old");
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+}
+
+fn float_attribute(name: &str, vertices: usize) -> Attribute {
+    Attribute { name: name.into(), values: AttributeValues::F32(vec![0.5; vertices]) }
+}
+
+fn float_values(attribute: &mut Attribute) -> &mut [f32] {
+    let AttributeValues::F32(values) = &mut attribute.values else { unreachable!() };
+    values
 }

@@ -1,13 +1,16 @@
 //! Geometry → PLY: the header as text, then rows packed in chunks on all cores and written in order.
 
-use std::io::Write;
+use std::io::{self, Write};
+use std::ops::Range;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 
+use super::columns::{pack_columns, pack_items};
 use crate::atomic::write_atomically;
 use crate::error::{Error, Result};
 use crate::geometry::{AttributeValues, Geometry};
 use crate::rows::{triple_bytes, write_rows};
-use crate::validate::CLOUDCOMPARE_PREFIX;
+use crate::validate::{CLOUDCOMPARE_PREFIX, any, is_non_finite, is_not_unit};
 
 /// Choices that other programs' habits make necessary. The default is plain names and no copies.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -21,12 +24,15 @@ pub struct PlyOptions {
 /// Values of neighbouring properties of a vertex. A whole block is copied at once: 32 feature columns one by one would
 /// pass over the rows 32 times.
 enum Source<'a> {
-    /// Three floats.
-    Vectors(&'a [[f32; 3]]),
-    /// Three bytes.
+    Positions(&'a [[f32; 3]]),
+    Normals(&'a [[f32; 3]]),
     Colors(&'a [[u8; 3]]),
-    /// An attribute.
-    Scalars(&'a AttributeValues),
+    /// Columns of attributes.
+    Floats(Vec<&'a [f32]>),
+    /// Likewise.
+    Integers(Vec<&'a [i32]>),
+    /// One of them.
+    Bytes(&'a [u8]),
     /// Rows of `.1` floats.
     Features(&'a [f32], usize),
 }
@@ -47,10 +53,18 @@ struct Block<'a> {
 /// `Inconsistent` or `NonFinite` when the geometry breaks its invariants or has no attribute called as
 /// `options.quality` says; `Io`.
 pub fn write_ply(path: &Path, geometry: &Geometry, options: &PlyOptions) -> Result<()> {
-    geometry.validate()?;
+    // Whatever went wrong first, what is wrong with the geometry is told, and what `validate` finds first of it.
+    write_valid(path, geometry, options).or_else(|error| geometry.validate().and(Err(error)))
+}
+
+/// Looks at the numbers of the columns as it packs them, when they are in the cache: before that, it would take a third
+/// as long as writing them.
+fn write_valid(path: &Path, geometry: &Geometry, options: &PlyOptions) -> Result<()> {
+    geometry.validate_all_but_columns()?;
     let blocks = blocks(geometry, options)?;
     let header = header(geometry, options, &blocks);
     let stride = blocks.iter().map(Block::size).sum();
+    let is_invalid = AtomicBool::new(false);
     write_atomically(path, |file| {
         file.write_all(header.as_bytes())?;
         write_rows(file, geometry.positions.len(), stride, |first_row, rows| {
@@ -58,8 +72,14 @@ pub fn write_ply(path: &Path, geometry: &Geometry, options: &PlyOptions) -> Resu
             for block in &blocks {
                 block.pack(first_row, rows, stride, at);
                 at += block.size();
+                if block.is_invalid(first_row..first_row + rows.len() / stride) {
+                    is_invalid.store(true, Ordering::Relaxed);
+                }
             }
         })?;
+        if is_invalid.load(Ordering::Relaxed) {
+            return Err(io::ErrorKind::InvalidData.into());
+        }
         write_rows(file, geometry.triangles.len(), FACE_BYTES, |first_face, rows| {
             for (row, triangle) in rows.chunks_exact_mut(FACE_BYTES).zip(&geometry.triangles[first_face..]) {
                 row[0] = 3;
@@ -74,22 +94,22 @@ const FACE_BYTES: usize = 13;
 
 fn blocks<'a>(geometry: &'a Geometry, options: &PlyOptions) -> Result<Vec<Block<'a>>> {
     let mut blocks = Vec::new();
-    let mut push = |names: &[&str], source| {
+    let mut push = |names: [&str; 3], source| {
         blocks.push(Block { names: names.iter().map(|&name| name.to_owned()).collect(), source });
     };
-    push(&["x", "y", "z"], Source::Vectors(&geometry.positions));
+    push(["x", "y", "z"], Source::Positions(&geometry.positions));
     if !geometry.normals.is_empty() {
-        push(&["nx", "ny", "nz"], Source::Vectors(&geometry.normals));
+        push(["nx", "ny", "nz"], Source::Normals(&geometry.normals));
     }
     if !geometry.colors.is_empty() {
-        push(&["red", "green", "blue"], Source::Colors(&geometry.colors));
+        push(["red", "green", "blue"], Source::Colors(&geometry.colors));
     }
     let prefix = if options.cloudcompare { CLOUDCOMPARE_PREFIX } else { "" };
     if let Some(quality) = &options.quality {
-        push(&["quality"], quality_source(geometry, quality)?);
+        push_attribute(&mut blocks, "quality".to_owned(), quality_values(geometry, quality)?);
     }
     for attribute in &geometry.attributes {
-        push(&[&format!("{prefix}{}", attribute.name)], Source::Scalars(&attribute.values));
+        push_attribute(&mut blocks, format!("{prefix}{}", attribute.name), &attribute.values);
     }
     for features in &geometry.features {
         let names = (0..features.dim).map(|d| format!("{prefix}{}", features.column(d))).collect();
@@ -98,13 +118,32 @@ fn blocks<'a>(geometry: &'a Geometry, options: &PlyOptions) -> Result<Vec<Block<
     Ok(blocks)
 }
 
-fn quality_source<'a>(geometry: &'a Geometry, quality: &str) -> Result<Source<'a>> {
+/// Adds a column to the last block, if that holds attributes of its type, else a block.
+fn push_attribute<'a>(blocks: &mut Vec<Block<'a>>, name: String, values: &'a AttributeValues) {
+    let last = blocks.last_mut();
+    let new = match (values, last) {
+        (AttributeValues::F32(values), Some(Block { names, source: Source::Floats(columns) })) => {
+            names.push(name);
+            return columns.push(values);
+        }
+        (AttributeValues::I32(values), Some(Block { names, source: Source::Integers(columns) })) => {
+            names.push(name);
+            return columns.push(values);
+        }
+        (AttributeValues::F32(values), _) => Source::Floats(vec![values]),
+        (AttributeValues::I32(values), _) => Source::Integers(vec![values]),
+        (AttributeValues::U8(values), _) => Source::Bytes(values),
+    };
+    blocks.push(Block { names: vec![name], source: new });
+}
+
+fn quality_values<'a>(geometry: &'a Geometry, quality: &str) -> Result<&'a AttributeValues> {
     if geometry.attributes.iter().any(|attribute| attribute.name == "quality") {
         let reason = "an attribute is called `quality` already; leave the option out";
         return Err(Error::inconsistent(&geometry.name, reason));
     }
     match geometry.attributes.iter().find(|attribute| attribute.name == quality) {
-        Some(attribute) => Ok(Source::Scalars(&attribute.values)),
+        Some(attribute) => Ok(&attribute.values),
         None => {
             let reason = format!("there is no attribute `{quality}` to write as `quality`");
             Err(Error::inconsistent(&geometry.name, reason))
@@ -141,9 +180,9 @@ fn header(geometry: &Geometry, options: &PlyOptions, blocks: &[Block]) -> String
 impl Block<'_> {
     fn type_name(&self) -> &'static str {
         match self.source {
-            Source::Vectors(_) | Source::Features(..) | Source::Scalars(AttributeValues::F32(_)) => "float",
-            Source::Scalars(AttributeValues::I32(_)) => "int",
-            Source::Colors(_) | Source::Scalars(AttributeValues::U8(_)) => "uchar",
+            Source::Positions(_) | Source::Normals(_) | Source::Floats(_) | Source::Features(..) => "float",
+            Source::Integers(_) => "int",
+            Source::Colors(_) | Source::Bytes(_) => "uchar",
         }
     }
 
@@ -154,37 +193,46 @@ impl Block<'_> {
 
     /// Puts the values of the rows from `first_row` at byte `at` of each `stride`-byte row of `rows`.
     fn pack(&self, first_row: usize, rows: &mut [u8], stride: usize, at: usize) {
-        match self.source {
-            Source::Vectors(vectors) => pack(rows, stride, at, vectors[first_row..].iter().map(vector_bytes)),
-            Source::Colors(colors) => pack(rows, stride, at, colors[first_row..].iter().copied()),
-            Source::Scalars(AttributeValues::F32(values)) => {
-                pack(rows, stride, at, values[first_row..].iter().map(|v| v.to_le_bytes()));
+        match &self.source {
+            Source::Positions(vectors) | Source::Normals(vectors) => {
+                pack_items(rows, stride, at, &vectors[first_row..], vector_bytes);
             }
-            Source::Scalars(AttributeValues::I32(values)) => {
-                pack(rows, stride, at, values[first_row..].iter().map(|v| v.to_le_bytes()));
+            Source::Colors(colors) => pack_items(rows, stride, at, &colors[first_row..], |color| color),
+            Source::Floats(columns) => {
+                pack_columns(rows, stride, at, first_row, columns, f32::to_le_bytes);
             }
-            Source::Scalars(AttributeValues::U8(values)) => {
-                pack(rows, stride, at, values[first_row..].iter().map(|&v| [v]));
+            Source::Integers(columns) => {
+                pack_columns(rows, stride, at, first_row, columns, i32::to_le_bytes);
             }
-            Source::Features(values, dim) => {
-                for (row, values) in
-                    rows.chunks_exact_mut(stride).zip(values[first_row * dim..].chunks_exact(dim))
+            Source::Bytes(values) => pack_items(rows, stride, at, &values[first_row..], |byte| [byte]),
+            &Source::Features(values, dim) => {
+                for (r, values) in
+                    values[first_row * dim..].chunks_exact(dim).take(rows.len() / stride).enumerate()
                 {
-                    for (to, value) in row[at..at + 4 * dim].as_chunks_mut::<4>().0.iter_mut().zip(values) {
+                    let row = &mut rows[r * stride + at..][..4 * dim];
+                    for (to, value) in row.as_chunks_mut::<4>().0.iter_mut().zip(values) {
                         *to = value.to_le_bytes();
                     }
                 }
             }
         }
     }
-}
 
-fn vector_bytes(vector: &[f32; 3]) -> [u8; 12] {
-    triple_bytes(bytemuck::cast(*vector))
-}
-
-fn pack<const N: usize>(rows: &mut [u8], stride: usize, at: usize, values: impl Iterator<Item = [u8; N]>) {
-    for (row, value) in rows.chunks_exact_mut(stride).zip(values) {
-        row[at..at + N].copy_from_slice(&value);
+    /// Whether [`Geometry::validate`] would refuse a value of `rows`.
+    fn is_invalid(&self, rows: Range<usize>) -> bool {
+        match &self.source {
+            Source::Positions(vectors) => any(vectors[rows].as_flattened(), is_non_finite),
+            Source::Normals(normals) => {
+                let normals = &normals[rows];
+                any(normals.as_flattened(), is_non_finite) || any(normals, is_not_unit)
+            }
+            Source::Floats(columns) => columns.iter().any(|column| any(&column[rows.clone()], is_non_finite)),
+            &Source::Features(values, dim) => any(&values[rows.start * dim..rows.end * dim], is_non_finite),
+            Source::Colors(_) | Source::Integers(_) | Source::Bytes(_) => false,
+        }
     }
+}
+
+fn vector_bytes(vector: [f32; 3]) -> [u8; 12] {
+    triple_bytes(bytemuck::cast(vector))
 }
