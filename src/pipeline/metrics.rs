@@ -55,7 +55,8 @@ pub struct Cost {
     /// Training steps.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub train_steps: Option<u64>,
-    /// Field evaluations, forward and backward, per second of training.
+    /// Field evaluations, one stream each, per second of training; those of `skipped.work.faint_samples` of the density
+    /// alone, the others forward and backward.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples_per_second: Option<f64>,
     /// Rays per second of training.

@@ -67,7 +67,8 @@ pub type Control = ControlFlow<()>;
 pub struct TrainReport {
     /// How far it came.
     pub state: TrainingState,
-    /// Field evaluations (forward and backward, one stream each) per second of training.
+    /// Field evaluations, one stream each, per second of training: forward and backward, but for those that are faint
+    /// ([`TrainingState::faint`]).
     pub samples_per_second: f64,
     /// Rays per second of training.
     pub rays_per_second: f64,
