@@ -15,7 +15,7 @@ const REACH: usize = RADIUS + 1;
 /// Depth of the pixels of view `n` with which enough of its neighbours agree; 0 elsewhere.
 pub(super) fn keep_agreeing(
     views: &[WorkView],
-    inverse: &[Vec<f32>],
+    inverse: &[&[f32]],
     n: usize,
     neighbours: &[usize],
     config: &StereoConfig,

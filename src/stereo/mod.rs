@@ -15,6 +15,8 @@ mod sweep;
 #[cfg(test)]
 mod tests;
 
+use std::sync::OnceLock;
+
 use glam::{DAffine3, Vec2, Vec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -148,68 +150,67 @@ impl StereoDepth {
     }
 }
 
-/// Depth of every frame, up to `farthest`; all zero for a frame that shares no view with another.
+/// The search for depth in a set of frames, wherever they are taken to be: what was compared once is kept, whether it is
+/// asked for to judge the poses or for good.
 ///
-/// With `continues` it is continued over even surfaces, which wants exact poses: one plane through what is wrong by some
-/// per cent is wrong everywhere. Deterministic, whatever the number of threads.
-pub fn depths(
-    frames: &[StereoFrame],
-    farthest: f32,
-    continues: bool,
-    config: &StereoConfig,
-) -> Vec<StereoDepth> {
-    let rig = Rig::new(frames, farthest, config);
-    let all: Vec<usize> = (0..frames.len()).collect();
-    let known = rig.matched(&all);
-    if !continues {
-        return all.into_iter().zip(known).map(|(n, known)| rig.depth(n, known)).collect();
-    }
-    let views = &rig.views;
-    let continued: Vec<Vec<f32>> =
-        all.par_iter().map(|n| fill::continued(&views[*n], *n, &known[*n])).collect();
-    all.par_iter().map(|n| rig.depth(*n, fill::checked(views, &known, &continued, *n))).collect()
-}
-
-/// Share of the pixels of the frames `of` whose depth is found by matching alone.
-pub fn coverage(frames: &[StereoFrame], of: &[usize], farthest: f32, config: &StereoConfig) -> f64 {
-    let depths = Rig::new(frames, farthest, config).matched(of);
-    let known = depths.iter().flatten().filter(|d| **d > 0.0).count();
-    known as f64 / depths.iter().map(Vec::len).sum::<usize>().max(1) as f64
-}
-
-/// All frames as they are compared.
-struct Rig<'a> {
+/// Deterministic, whatever the number of threads.
+pub struct Search {
     views: Vec<WorkView>,
     planes: sweep::Planes,
-    config: &'a StereoConfig,
+    config: StereoConfig,
+    /// Inverse depth of each frame by its own neighbours, when that was first needed.
+    raw: Vec<OnceLock<Vec<f32>>>,
 }
 
-impl<'a> Rig<'a> {
-    fn new(frames: &[StereoFrame], farthest: f32, config: &'a StereoConfig) -> Self {
+impl Search {
+    /// A search for depths up to `farthest`.
+    pub fn new(frames: &[StereoFrame], farthest: f32, config: &StereoConfig) -> Self {
         Self {
             views: frames.par_iter().map(|f| WorkView::new(f, config.size)).collect(),
             planes: sweep::Planes::new(config.nearest * farthest, farthest, config.depths),
-            config,
+            config: config.clone(),
+            raw: (0..frames.len()).map(|_| OnceLock::new()).collect(),
         }
+    }
+
+    /// Depth of every frame; all zero for a frame that shares no view with another.
+    ///
+    /// With `continues` it is continued over even surfaces, which wants exact poses: one plane through what is wrong by
+    /// some per cent is wrong everywhere.
+    pub fn depths(&self, continues: bool) -> Vec<StereoDepth> {
+        let all: Vec<usize> = (0..self.views.len()).collect();
+        let known = self.matched(&all);
+        if !continues {
+            return all.into_iter().zip(known).map(|(n, known)| self.depth(n, known)).collect();
+        }
+        let views = &self.views;
+        let continued: Vec<Vec<f32>> =
+            all.par_iter().map(|n| fill::continued(&views[*n], *n, &known[*n])).collect();
+        all.par_iter().map(|n| self.depth(*n, fill::checked(views, &known, &continued, *n))).collect()
+    }
+
+    /// Share of the pixels of the frames `of` whose depth is found by matching alone.
+    pub fn coverage(&self, of: &[usize]) -> f64 {
+        let depths = self.matched(of);
+        let known = depths.iter().flatten().filter(|d| **d > 0.0).count();
+        known as f64 / depths.iter().map(Vec::len).sum::<usize>().max(1) as f64
     }
 
     /// Depth of the frames `of` where enough of their neighbours agree; 0 elsewhere.
     fn matched(&self, of: &[usize]) -> Vec<Vec<f32>> {
-        let Self { views, planes, config } = self;
+        let Self { views, planes, config, raw } = self;
         let neighbours = |n: &usize| rig::neighbours(views, *n, planes, config);
         let asked: Vec<Vec<usize>> = of.par_iter().map(neighbours).collect();
-        let mut needed = vec![false; views.len()];
-        of.iter().chain(asked.iter().flatten()).for_each(|n| needed[*n] = true);
-        let raw: Vec<Vec<f32>> = (0..views.len())
-            .into_par_iter()
-            .map(|n| match needed[n] {
-                true => sweep::inverse_depth(views, n, &neighbours(&n), planes),
-                false => Vec::new(),
-            })
-            .collect();
+        let mut needed: Vec<usize> = of.iter().chain(asked.iter().flatten()).copied().collect();
+        needed.sort_unstable();
+        needed.dedup();
+        needed.into_par_iter().for_each(|n| {
+            raw[n].get_or_init(|| sweep::inverse_depth(views, n, &neighbours(&n), planes));
+        });
+        let raw: Vec<&[f32]> = raw.iter().map(|raw| raw.get().map_or(&[][..], Vec::as_slice)).collect();
         let agreed = |(n, neighbours): (&usize, &Vec<usize>)| {
             let mut depth = consistency::keep_agreeing(views, &raw, *n, neighbours, config);
-            consistency::drop_edges(&raw[*n], views[*n].width, &mut depth);
+            consistency::drop_edges(raw[*n], views[*n].width, &mut depth);
             depth
         };
         of.par_iter().zip(&asked).map(agreed).collect()

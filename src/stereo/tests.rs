@@ -35,11 +35,26 @@ fn poses() -> Vec<DAffine3> {
         .to_vec()
 }
 
-fn look(camera: &Camera, poses: &[DAffine3], plain: bool) -> Vec<StereoDepth> {
+fn search(camera: &Camera, poses: &[DAffine3], plain: bool) -> Search {
     let pictures: Vec<_> = poses.iter().map(|p| picture(camera, p, plain)).collect();
     let frames: Vec<StereoFrame> =
         poses.iter().zip(&pictures).map(|(c2w, rgb)| StereoFrame { camera, c2w: *c2w, rgb }).collect();
-    depths(&frames, 5.0, false, &StereoConfig::default())
+    Search::new(&frames, 5.0, &StereoConfig::default())
+}
+
+fn look(camera: &Camera, poses: &[DAffine3], plain: bool) -> Vec<StereoDepth> {
+    search(camera, poses, plain).depths(false)
+}
+
+#[test]
+fn depth_is_the_same_whether_poses_were_judged_before() {
+    let judging = search(&CAMERA, &poses(), false);
+    let share = judging.coverage(&[1]);
+    assert!(share > 0.5, "coverage {share}");
+    for continues in [false, true] {
+        assert!(judging.depths(continues) == search(&CAMERA, &poses(), false).depths(continues));
+    }
+    assert_eq!(judging.coverage(&[1]), share);
 }
 
 #[test]
@@ -80,7 +95,7 @@ fn nothing_is_claimed_where_nothing_can_be_known() {
             assert!(found.coverage() < 0.02, "{}", found.coverage());
         }
     }
-    assert!(depths(&[], 5.0, true, &StereoConfig::default()).is_empty());
+    assert!(Search::new(&[], 5.0, &StereoConfig::default()).depths(true).is_empty());
 }
 
 #[test]

@@ -78,25 +78,21 @@ impl PixelSet {
         (time + f64::from(spread) * (from + f64::from(u) * (to - from) - time)) as f32
     }
 
-    /// Finds the depth of the frames by stereo, from where the field says that they are, in units; `exact` if that is where
-    /// they are.
-    pub fn look_at_depth(&mut self, field: &Field, exact: bool, config: &StereoConfig) {
+    /// A search for the depth of the frames by stereo, from where the field says that they are, in units.
+    pub fn stereo_search(&self, field: &Field, config: &StereoConfig) -> stereo::Search {
         let cameras = self.refined_cameras(field);
-        let farthest = field.normalisation.extent.length();
-        self.stereo = stereo::depths(&self.stereo_frames(&cameras), farthest, exact, config);
+        stereo::Search::new(&self.stereo_frames(&cameras), field.normalisation.extent.length(), config)
+    }
+
+    /// Takes the depth that `search` finds, which was made with this field; `exact` if the frames are where it says.
+    pub fn take_depth(&mut self, field: &Field, search: &stereo::Search, exact: bool) {
+        self.stereo = search.depths(exact);
         for (depth, frame) in self.stereo.iter_mut().zip(&self.frames) {
             // Asked by the directions that the scene's own intrinsics give.
             depth.refine(View::new(field, frame).lens);
         }
         let coverage = self.stereo.iter().map(StereoDepth::coverage).sum::<f64>();
         tracing::info!(coverage = coverage / self.frames.len().max(1) as f64, "depth by stereo");
-    }
-
-    /// Share of the pixels of the frames `of` that stereo matches from where the field says that the frames are.
-    pub fn stereo_coverage(&self, field: &Field, of: &[usize], config: &StereoConfig) -> f64 {
-        let cameras = self.refined_cameras(field);
-        let farthest = field.normalisation.extent.length();
-        stereo::coverage(&self.stereo_frames(&cameras), of, farthest, config)
     }
 
     fn stereo_frames<'a>(&'a self, cameras: &'a [(Camera, DAffine3)]) -> Vec<StereoFrame<'a>> {

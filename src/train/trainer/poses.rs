@@ -7,6 +7,7 @@ use crate::config::Config;
 use crate::field::Stream;
 use crate::render::forward::Model;
 use crate::render::sampler::Sampling;
+use crate::stereo::Search;
 use crate::train::align;
 use crate::train::checkpoint::Trained;
 
@@ -44,7 +45,8 @@ impl Trainer {
         let judged = self.judged_frames();
         let Trained { field, progress, .. } = &mut self.trained;
         let start = Instant::now();
-        progress.given_coverage = refined.then(|| self.pixels.stereo_coverage(field, &judged, stereo));
+        let search = self.pixels.stereo_search(field, stereo);
+        progress.given_coverage = refined.then(|| search.coverage(&judged));
         // Frames are judged together with those that they are compared with.
         let frames = self.pixels.frames.len();
         let looked_at = (judged.len() * (1 + stereo.neighbours)).min(frames).max(1);
@@ -53,7 +55,7 @@ impl Trainer {
         self.stereo_cost = refined.then(|| start.elapsed().as_secs_f64() * times);
         progress.trusts_poses = progress.given_coverage.is_none_or(|share| share >= WELL_POSED);
         if progress.trusts_poses {
-            self.look_at_depth();
+            self.find_depth(Some(search));
         }
     }
 
@@ -86,39 +88,46 @@ impl Trainer {
     /// Finds the depth of the training frames by stereo, unless that is done or not wanted: from where they are by now
     /// or from where they were given, whichever finds more; or from where they were when a training that goes on did so.
     pub(super) fn look_at_depth(&mut self) {
+        self.find_depth(None);
+    }
+
+    /// [`Self::look_at_depth`]; `search` if one was begun with the field as it is.
+    fn find_depth(&mut self, mut search: Option<Search>) {
         let unwanted = self.config.train.stereo_at >= 1.0 || self.trained.progress.stereo_left_out.is_some();
         if unwanted || !self.pixels.stereo.is_empty() {
             return;
         }
         if self.trained.progress.stereo_from.is_none() {
-            self.settle_poses();
+            search = search.or_else(|| self.settle_poses());
         }
         let Trained { field, progress, .. } = &mut self.trained;
         let refinement = field.layout.refinement();
         let now = field.weights[refinement.clone()].to_vec();
         let then = progress.stereo_from.get_or_insert_with(|| now.clone());
         field.weights[refinement.clone()].copy_from_slice(then);
-        self.pixels.look_at_depth(field, progress.trusts_poses, &self.config.stereo);
+        let search = search.unwrap_or_else(|| self.pixels.stereo_search(field, &self.config.stereo));
+        self.pixels.take_depth(field, &search, progress.trusts_poses);
         if field.shape.streams[Stream::Dynamic as usize] && self.config.loss.moving > 0.0 {
             self.pixels.look_for_movement(field, self.masks.take().as_ref());
         }
         field.weights[refinement].copy_from_slice(&now);
     }
 
-    /// Undoes the refinement of the poses if stereo finds less from them than from the poses as they were given.
-    pub(super) fn settle_poses(&mut self) {
-        let Some(given) = self.trained.progress.given_coverage else { return };
-        if self.trained.progress.trusts_poses {
-            return;
-        }
+    /// Undoes the refinement of the poses if stereo finds less from them than from the poses as they were given; otherwise
+    /// the search that has told so goes on.
+    pub(super) fn settle_poses(&mut self) -> Option<Search> {
+        let given = self.trained.progress.given_coverage.filter(|_| !self.trained.progress.trusts_poses)?;
         let judged = self.judged_frames();
         let Trained { field, progress, .. } = &mut self.trained;
-        let refined = self.pixels.stereo_coverage(field, &judged, &self.config.stereo);
-        if refined < given {
-            let refinement = field.layout.refinement();
-            field.weights[refinement].fill(0.0);
-            progress.trusts_poses = true;
-        }
+        let search = self.pixels.stereo_search(field, &self.config.stereo);
+        let refined = search.coverage(&judged);
         tracing::info!(given, refined, "depth by stereo from poses as given and as refined");
+        if refined >= given {
+            return Some(search);
+        }
+        let refinement = field.layout.refinement();
+        field.weights[refinement].fill(0.0);
+        progress.trusts_poses = true;
+        None
     }
 }
