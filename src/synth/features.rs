@@ -1,7 +1,8 @@
 //! Surrogate features: what image-language, video-language and part models might say about the pictures, made from
 //! the true instances instead. No network is run.
 //!
-//! The embedding of a phrase is a random unit vector. A descriptor of a mask is the embedding of its thing's phrase,
+//! The embedding of a phrase is a random unit vector, that of a canonical phrase lies between some of those: what may be said of
+//! anything is a little like all of it. A descriptor of a mask is the embedding of its thing's phrase,
 //! a constant vector (the gap between features of images and of texts) and noise, to unit length; descriptors of
 //! boxes and of video patches mix what they show by area. In the video space a thing stands for what is done with it.
 //! All are half random and half exact: enough to train, ask and measure on, and no claim about real models.
@@ -92,8 +93,21 @@ fn unit(count: usize, rng: &mut Rng) -> Vec<f32> {
     values
 }
 
+/// What lies somewhere between `rows`, and `apart` from them.
+fn general(rows: &[Vec<f32>], apart: &[f32], rng: &mut Rng) -> Vec<f32> {
+    let mut sum = vec![0.0; DIM];
+    for row in rows {
+        let share = rng.range(0.0, 1.0);
+        sum.iter_mut().zip(row).for_each(|(s, v)| *s += share * v);
+    }
+    normalise(&mut sum);
+    sum.iter_mut().zip(apart).for_each(|(s, v)| *s += v);
+    normalise(&mut sum);
+    sum
+}
+
 impl Embeddings {
-    /// `of_thing` is the phrase that a thing is like; without one it is like nothing that has a name.
+    /// `of_thing` is the phrase that a thing is like; without one it is like nothing in particular.
     fn new(
         space: Space,
         mut phrases: Vec<String>,
@@ -101,13 +115,16 @@ impl Embeddings {
         things: &[Thing],
         rng: &mut Rng,
     ) -> Self {
-        phrases.extend(space.canonical_phrases().iter().map(|p| (*p).to_owned()));
-        let rows: Vec<Vec<f32>> = phrases.iter().map(|_| unit(DIM, rng)).collect();
-        let mut named = |thing: &Thing| {
-            let row = of_thing(thing).and_then(|phrase| phrases.iter().position(|p| *p == phrase));
-            row.map_or_else(|| unit(DIM, rng), |row| rows[row].clone())
+        let mut rows: Vec<Vec<f32>> = phrases.iter().map(|_| unit(DIM, rng)).collect();
+        let mut like = |thing: &Thing| {
+            let named = of_thing(thing).and_then(|phrase| phrases.iter().position(|p| *p == phrase));
+            named.map_or_else(|| general(&rows, &unit(DIM, rng), rng), |row| rows[row].clone())
         };
-        let things = things.iter().map(&mut named).collect();
+        let things = things.iter().map(&mut like).collect();
+        let canonical = space.canonical_phrases();
+        let general: Vec<_> = canonical.iter().map(|_| general(&rows, &[0.0; DIM], rng)).collect();
+        rows.extend(general);
+        phrases.extend(canonical.iter().map(|p| (*p).to_owned()));
         let gap = unit(DIM, rng);
         Self { phrases, rows, things, gap }
     }
