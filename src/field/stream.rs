@@ -251,8 +251,12 @@ impl LevelTask<'_> {
     #[inline(always)]
     pub fn run(self) {
         let Self { level, table, pos, lanes, slopes, out } = self;
-        out.rows.resize(pos.len() * TILE, Row::ZERO);
-        out.rows[lanes..].fill(Row::ZERO);
+        let wanted = pos.len() * TILE;
+        // What an earlier, larger batch has left behind is of no one's concern.
+        if out.rows.len() < wanted {
+            out.rows.resize(wanted, Row::ZERO);
+        }
+        out.rows[lanes..wanted].fill(Row::ZERO);
         let tiles = pos.iter().zip(out.rows[..lanes].chunks_mut(TILE));
         if slopes {
             out.slopes.resize(pos.len() * TILE, [Row::ZERO; 3]);
