@@ -12,6 +12,9 @@ step() {
     echo "== $*"
 }
 
+free_gb=$(df -Pk . | awk 'NR == 2 { print int($4 / 1e6) }')
+[ "$free_gb" -ge 20 ] || echo "!! $free_gb GB of disk are free; the first time, tools and builds take 20 GB"
+
 step "tools that read our files"
 tests/tools/setup.sh
 
