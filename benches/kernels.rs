@@ -1,11 +1,9 @@
 //! The kernels of a training step, each beside the least time that the machine allows for it.
 //!
-//! `cargo bench --bench kernels`. The floors come from what the machine can do at most, measured on a Xeon of the
-//! Sapphire Rapids family; another machine's figures are given by the environment:
-//! `DIVFF_F32_GFLOPS`, `DIVFF_BF16_GFLOPS`, `DIVFF_MROWS` (random 16-byte reads of a 2 MiB table a second, in millions),
-//! `DIVFF_GBPS` (read and written).
+//! `cargo bench --bench kernels`. The floors come from what one thread of the machine can do at most, measured first.
 
 use std::hint::black_box;
+use std::sync::LazyLock;
 
 use criterion::{Criterion, Throughput, criterion_main};
 use divff::field::hashgrid::{AXES, HashGrid, Lattice, Points, Row};
@@ -20,15 +18,16 @@ use divff::train::adam::{StepSize, TableState};
 use glam::Vec3;
 use pulp::{Simd, WithSimd};
 
+mod machine;
+use machine::Machine;
+
+static MACHINE: LazyLock<Machine> = LazyLock::new(|| Machine::measure(1));
+
 /// Tiles of a chunk of 32 rays.
 const TILES: usize = 13;
 
 /// Samples of the table kernels: as many reads of a table as a step of 4096 rays makes.
 const POINTS: usize = 20 * 4096;
-
-fn rate(name: &str, default: f64) -> f64 {
-    std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(default)
-}
 
 /// Prints the least time for `work` at `per_second`.
 fn floor(kernel: &str, work: f64, per_second: f64) {
@@ -90,10 +89,7 @@ fn networks(c: &mut Criterion) {
     let net = Mlp::new(&[40, 64, 64, 16]);
     let params = net.init(|| numbers.next());
     let flops = 2.0 * (net.multiply_adds() * TILES * TILE) as f64;
-    for (precision, peak) in [
-        (Precision::F32, rate("DIVFF_F32_GFLOPS", 140.0)),
-        (Precision::Bf16, rate("DIVFF_BF16_GFLOPS", 2600.0)),
-    ] {
+    for (precision, peak) in [(Precision::F32, MACHINE.flops), (Precision::Bf16, MACHINE.bf16_flops)] {
         let packed = net.pack(&params, precision);
         let mut activations = Activations::default();
         net.reserve(&packed, TILES, &mut activations);
@@ -106,7 +102,7 @@ fn networks(c: &mut Criterion) {
             [("forward", Pass::Forward), ("backward", Pass::Backward), ("weights", Pass::WeightGradients)];
         for (name, pass) in passes {
             let name = format!("network {precision:?} {name}");
-            floor(&name, flops, 1e9 * peak);
+            floor(&name, flops, peak);
             let mut group = c.benchmark_group("network");
             group.throughput(Throughput::Elements((TILES * TILE) as u64));
             group.bench_function(name, |b| {
@@ -176,24 +172,23 @@ fn tables(c: &mut Criterion) {
     let mut state = TableState::new(level.rows);
     let mut rows = vec![Row::ONE; points.len() * TILE];
     let lookups = 8.0 * (points.len() * TILE) as f64;
-    let per_second = 1e6 * rate("DIVFF_MROWS", 600.0);
     let mut group = c.benchmark_group("table");
     group.throughput(Throughput::Elements(POINTS as u64));
     group.sample_size(30);
-    floor("encode", lookups, per_second);
+    floor("encode", lookups, MACHINE.rows);
     group.bench_function("encode", |b| {
         b.iter(|| {
             pulp::Arch::new().dispatch(TablePass(level, &points, Table::Encode(&table, &mut rows)));
         });
     });
-    floor("scatter", lookups, per_second);
+    floor("scatter", lookups, MACHINE.added_rows);
     group.bench_function("scatter", |b| {
         b.iter(|| {
             pulp::Arch::new().dispatch(TablePass(level, &points, Table::Scatter(&mut state.grad, &rows)));
         });
     });
     // Four tables read and written.
-    floor("adam", 8.0 * 16.0 * level.rows as f64, 1e9 * rate("DIVFF_GBPS", 17.0));
+    floor("adam", 8.0 * 16.0 * level.rows as f64, MACHINE.bytes);
     group.bench_function("adam", |b| {
         b.iter(|| {
             state.grad.fill(Row::ONE);
@@ -263,7 +258,7 @@ fn rays(c: &mut Criterion) {
     let mut group = c.benchmark_group("rays");
     group.throughput(Throughput::Elements((rays.len() * SAMPLING.count) as u64));
     // A quarter of the way is behind the wall; neighbouring steps share cache lines, so that a step is one load.
-    floor("sampler", 32.0 * 0.75 * 128.0, 1e6 * rate("DIVFF_MROWS", 600.0));
+    floor("sampler", 32.0 * 0.75 * 128.0, MACHINE.rows);
     group.bench_function("sampler", |b| {
         b.iter(|| pulp::Arch::new().dispatch(SamplerPass(&mut sampler, &wall, &rays, &mut edges)));
     });
@@ -272,7 +267,7 @@ fn rays(c: &mut Criterion) {
     let mut weighted = vec![Weighted::default(); intervals.len()];
     let mut d_sigma = vec![[0.0; 3]; intervals.len()];
     // Two exponentials of some twenty operations, and as many again to mix three streams forward and backward.
-    floor("composite", 80.0 * intervals.len() as f64, 1e9 * rate("DIVFF_F32_GFLOPS", 140.0));
+    floor("composite", 80.0 * intervals.len() as f64, MACHINE.flops);
     group.bench_function("composite", |b| {
         b.iter(|| pulp::Arch::new().dispatch(CompositePass(&intervals, &mut weighted, &mut d_sigma)));
     });
@@ -283,4 +278,3 @@ mod groups {
     criterion::criterion_group!(benches, super::networks, super::tables, super::rays);
 }
 criterion_main!(groups::benches);
-//(benches, networks, tables, rays);

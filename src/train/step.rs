@@ -99,10 +99,10 @@ pub struct StepReport {
     pub squared: f64,
     /// Rays traced.
     pub rays: usize,
-    /// Field evaluations, one stream each.
-    pub evaluations: usize,
+    /// Field evaluations of each stream.
+    pub evaluations: [usize; 3],
     /// Of them those that gave too little light for their colour to be looked at and for anything to be learned from them.
-    pub faint: usize,
+    pub faint: [usize; 3],
     /// Samples placed, times streams: what would have been evaluated without occupancy.
     pub candidates: usize,
     /// Samples placed, times streams that the field does not have.
@@ -182,8 +182,10 @@ impl Optimiser {
         for g in &self.groups {
             report.loss += g.loss.total / rays as f64;
             report.squared += g.loss.squared / rays as f64;
-            report.evaluations += g.evaluations;
-            report.faint += g.faint;
+            for s in 0..3 {
+                report.evaluations[s] += g.evaluations[s];
+                report.faint[s] += g.faint[s];
+            }
             report.spared += g.spared;
             report.diverged = report.diverged.or(g.diverged);
         }
@@ -191,7 +193,8 @@ impl Optimiser {
         report.candidates = rays * plan.sampling.count * live;
         report.absent = rays * plan.sampling.count * field.nets.iter().filter(|net| net.is_none()).count();
         if plan.pose_rate == 0.0 && plan.rig_rate == 0.0 {
-            report.unrefined = (report.evaluations - report.faint) / group::REFINE_EVERY as usize;
+            let [evaluations, faint] = [report.evaluations, report.faint].map(|n| n.iter().sum::<usize>());
+            report.unrefined = (evaluations - faint) / group::REFINE_EVERY as usize;
         }
         update(self, field, grids, plan);
         report

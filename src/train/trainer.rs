@@ -32,8 +32,9 @@ const REPORT_EVERY: u64 = 50;
 /// Steps between two looks at the held-out frames.
 const TEST_EVERY: u64 = 500;
 
-/// Every how many pixels, in both directions, a held-out frame is looked at while training.
-const TEST_STRIDE: u32 = 8;
+/// Pixels of the held-out frames that are looked at while training, about: they tell the PSNR to a tenth of a decibel or two, and
+/// more would cost a large scene's training more than that is worth.
+const TEST_PIXELS: f64 = 4000.0;
 
 /// Share of the light that a cell of a density grid must be able to stop for its stream to be evaluated there.
 const OCCUPIED_ALPHA: f32 = 0.005;
@@ -51,7 +52,7 @@ pub struct Progress {
     pub loss: f64,
     /// PSNR of the rays since the last report, dB.
     pub psnr: f64,
-    /// PSNR of the held-out frames (every 8th pixel) when last looked at, dB.
+    /// PSNR of the held-out frames (some thousand pixels of all) when last looked at, dB.
     pub test_psnr: Option<f64>,
     /// Rays per second since the last report.
     pub rays_per_second: f64,
@@ -267,8 +268,8 @@ impl Trainer {
     fn count(&mut self, report: &StepReport) {
         let progress = &mut self.trained.progress;
         progress.rays += report.rays as u64;
-        progress.evaluations += report.evaluations as u64;
-        progress.faint += report.faint as u64;
+        progress.evaluations += report.evaluations.iter().sum::<usize>() as u64;
+        progress.faint += report.faint.iter().sum::<usize>() as u64;
         progress.candidates += report.candidates as u64;
         progress.absent += report.absent as u64;
         progress.spared += report.spared;
@@ -312,11 +313,13 @@ impl Trainer {
         }
         let model = Model::new(&self.trained.field, &self.trained.grids, self.streams);
         let sampling = self.config.train.render_sampling();
+        let pixels: usize = self.test.images.iter().map(Vec::len).sum();
+        let stride = (pixels as f64 / TEST_PIXELS).sqrt().ceil() as u32;
         let (mut squared, mut count) = (0.0, 0usize);
         for (frame, truth) in self.test.frames.iter().zip(&self.test.images) {
-            let image = render(&model, frame, &sampling, TEST_STRIDE);
+            let image = render(&model, frame, &sampling, stride);
             for (n, rgb) in image.rgb.iter().enumerate() {
-                let (x, y) = (n as u32 % image.width * TEST_STRIDE, n as u32 / image.width * TEST_STRIDE);
+                let (x, y) = (n as u32 % image.width * stride, n as u32 / image.width * stride);
                 let truth = truth[(y * frame.camera.width + x) as usize];
                 for c in 0..3 {
                     squared += (f64::from(rgb[c]) - f64::from(truth[c]) / 255.0).powi(2);
@@ -383,7 +386,7 @@ impl Window {
     fn add(&mut self, report: &StepReport) {
         self.steps += 1;
         self.rays += report.rays;
-        self.evaluations += report.evaluations;
+        self.evaluations += report.evaluations.iter().sum::<usize>();
         self.loss += report.loss;
         self.squared += report.squared;
     }

@@ -62,9 +62,10 @@ pub struct Group {
     pub loss: ChunkLoss,
     /// Number of the first chunk whose loss is not finite.
     pub diverged: Option<usize>,
-    pub evaluations: usize,
+    /// Samples at which each stream was evaluated.
+    pub evaluations: [usize; 3],
     /// Those of them that gave too little light to be learned from.
-    pub faint: usize,
+    pub faint: [usize; 3],
     /// Steps through the density grids that its rays were spared.
     pub spared: u64,
 }
@@ -101,15 +102,16 @@ impl Group {
         } = self;
         dense.clear();
         dense.resize(context.model.field.layout.len, 0.0);
-        (*loss, *diverged, *evaluations, *faint) = (ChunkLoss::default(), None, 0, 0);
+        (*loss, *diverged, *evaluations, *faint) = (ChunkLoss::default(), None, [0; 3], [0; 3]);
         for (number, chunk) in (*first..).zip(chunks) {
             let l = chunk.evaluate(simd, context, tracer, gradient, number);
             loss.total += l.total;
             loss.squared += l.squared;
             *diverged = diverged.or((!l.total.is_finite()).then_some(number));
-            let placed: usize = chunk.traced.cells.iter().map(Vec::len).sum();
-            *evaluations += placed;
-            *faint += placed - chunk.traced.batches.iter().map(StreamBatch::len).sum::<usize>();
+            for (s, (cells, batch)) in chunk.traced.cells.iter().zip(&chunk.traced.batches).enumerate() {
+                evaluations[s] += cells.len();
+                faint[s] += cells.len() - batch.len();
+            }
             chunk.backward(simd, context, tracer, gradient, dense);
         }
         for (s, refresh) in refresh.iter_mut().enumerate() {

@@ -1,0 +1,160 @@
+//! What this machine can do at most: the units of the floors that benchmarks print beside times.
+//!
+//! Measured on the spot, since floors of another machine say nothing.
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use divff::field::hashgrid::Row;
+use pulp::{Simd, WithSimd};
+use rayon::prelude::*;
+
+/// Rounds of which the fastest counts.
+const ROUNDS: usize = 5;
+
+/// Rows of a table of 2 MiB, as a level has.
+const ROWS: usize = 1 << 17;
+
+/// Floats that no cache holds.
+const FLOATS: usize = 1 << 26;
+
+/// Rates of some threads together.
+pub struct Machine {
+    /// Floating-point operations a second in f32, a fused multiply-add being two.
+    pub flops: f64,
+    /// The same in bf16 on the matrix units. Not measured: 2600 GFLOP/s a thread, unless `DIVFF_BF16_GFLOPS` says otherwise.
+    pub bf16_flops: f64,
+    /// Rows of 16 bytes read a second from random places of a table of 2 MiB, one table a thread.
+    pub rows: f64,
+    /// Rows added to a second there: read, and written back.
+    pub added_rows: f64,
+    /// Bytes a second read from memory and written back.
+    pub bytes: f64,
+}
+
+impl Machine {
+    /// Measures `threads` threads.
+    pub fn measure(threads: usize) -> Self {
+        let pool =
+            rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads can be started");
+        let bf16 = std::env::var("DIVFF_BF16_GFLOPS").ok().and_then(|v| v.parse().ok()).unwrap_or(2600.0);
+        pool.install(|| Self {
+            flops: best(|| together(threads, || pulp::Arch::new().dispatch(MultiplyAdds))),
+            bf16_flops: 1e9 * bf16 * threads as f64,
+            rows: best(|| together(threads, || pulp::Arch::new().dispatch(Reads(&vec![Row::ONE; ROWS])))),
+            added_rows: best(|| {
+                together(threads, || pulp::Arch::new().dispatch(Adds(&mut vec![Row::ONE; ROWS])))
+            }),
+            bytes: bytes(threads),
+        })
+    }
+}
+
+fn best(rate: impl Fn() -> f64) -> f64 {
+    (0..ROUNDS).map(|_| rate()).fold(0.0, f64::max)
+}
+
+/// What all threads do a second when each does `work`, which says how much that was.
+fn together(threads: usize, work: impl Fn() -> f64 + Sync) -> f64 {
+    let start = Instant::now();
+    let done: f64 = (0..threads).into_par_iter().map(|_| work()).sum();
+    done / start.elapsed().as_secs_f64()
+}
+
+fn bytes(threads: usize) -> f64 {
+    let mut floats = vec![1f32; FLOATS];
+    let chunk = FLOATS / threads.max(1);
+    let mut round = || {
+        let start = Instant::now();
+        floats.par_chunks_mut(chunk).for_each(|c| c.iter_mut().for_each(|v| *v *= 0.999));
+        2.0 * size_of::<f32>() as f64 * FLOATS as f64 / start.elapsed().as_secs_f64()
+    };
+    let fastest = (0..ROUNDS).map(|_| round()).fold(0.0, f64::max);
+    black_box(&floats);
+    fastest
+}
+
+/// As many sums as hide the latency of a fused multiply-add.
+struct MultiplyAdds;
+
+impl WithSimd for MultiplyAdds {
+    type Output = f64;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> f64 {
+        const SUMS: usize = 12;
+        const TIMES: usize = 4_000_000;
+        let (a, b) = (simd.splat_f32s(black_box(0.5)), simd.splat_f32s(black_box(1.0)));
+        let mut sums = [simd.splat_f32s(0.0); SUMS];
+        for _ in 0..TIMES {
+            for sum in &mut sums {
+                *sum = simd.mul_add_f32s(a, *sum, b);
+            }
+        }
+        for sum in sums {
+            black_box(simd.reduce_sum_f32s(sum));
+        }
+        (2 * SUMS * TIMES * S::F32_LANES) as f64
+    }
+}
+
+/// Times that [`LANES`] rows are read or added to.
+const TIMES: usize = 1 << 21;
+
+/// Sequences of random rows that do not wait for one another.
+const LANES: usize = 16;
+
+/// Random numbers of rows.
+struct Places([u32; LANES]);
+
+impl Places {
+    fn new() -> Self {
+        Self(std::array::from_fn(|n| 2 * n as u32 + 1))
+    }
+
+    #[inline(always)]
+    fn next(&mut self) -> [usize; LANES] {
+        for s in &mut self.0 {
+            *s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        }
+        self.0.map(|s| (s >> 15) as usize % ROWS)
+    }
+}
+
+/// Reads of rows.
+struct Reads<'a>(&'a [Row]);
+
+impl WithSimd for Reads<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) -> f64 {
+        let (mut places, mut sums) = (Places::new(), [Row::ZERO; 4]);
+        for _ in 0..TIMES {
+            for (n, row) in places.next().into_iter().enumerate() {
+                sums[n % 4] += self.0[row];
+            }
+        }
+        black_box(sums);
+        (LANES * TIMES) as f64
+    }
+}
+
+/// Rows that something is added to.
+struct Adds<'a>(&'a mut [Row]);
+
+impl WithSimd for Adds<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) -> f64 {
+        let mut places = Places::new();
+        for _ in 0..TIMES {
+            for row in places.next() {
+                self.0[row] += Row::ONE;
+            }
+        }
+        black_box(self.0);
+        (LANES * TIMES) as f64
+    }
+}
