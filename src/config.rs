@@ -76,7 +76,11 @@ impl Config {
         let mut config = Self::default();
         match preset {
             // Of few rays, more steps of fewer each teach more: poses and what moves wait for steps.
-            Preset::Draft => (config.train.steps, config.train.rays) = (1400, 2048),
+            Preset::Draft => {
+                (config.train.steps, config.train.rays) = (1400, 2048);
+                // An alignment takes as long as a hundred of its steps.
+                config.train.align_at = vec![0.17, 0.3, 0.45, 0.6];
+            }
             Preset::Standard => {}
             Preset::Fine => config.train.steps *= 5,
         }
