@@ -189,7 +189,7 @@ impl Page<'_> {
             out.push_str(curve);
             out.push_str(
                 "<p class=\"note key\">PSNR of<i style=\"background: var(--accent)\"></i>training rays\
-                 <i style=\"background: var(--test)\"></i>held-out frames (some thousand pixels)</p>",
+                 <i style=\"background: var(--test)\"></i>held-out frames (some of their pixels)</p>",
             );
         });
     }

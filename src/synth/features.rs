@@ -1,7 +1,7 @@
 //! Surrogate features: what image-language, video-language and part models might say about the pictures, made from
 //! the true instances instead. No network is run.
 //!
-//! The embedding of a phrase is a random unit vector, that of a canonical phrase lies between some of those: what may be said of
+//! The embedding of a phrase is a random unit vector, that of a canonical phrase lies between those: what may be said of
 //! anything is a little like all of it. A descriptor of a mask is the embedding of its thing's phrase,
 //! a constant vector (the gap between features of images and of texts) and noise, to unit length; descriptors of
 //! boxes and of video patches mix what they show by area. In the video space a thing stands for what is done with it.
@@ -122,8 +122,8 @@ impl Embeddings {
         };
         let things = things.iter().map(&mut like).collect();
         let canonical = space.canonical_phrases();
-        let general: Vec<_> = canonical.iter().map(|_| general(&rows, &[0.0; DIM], rng)).collect();
-        rows.extend(general);
+        let between: Vec<_> = canonical.iter().map(|_| general(&rows, &[0.0; DIM], rng)).collect();
+        rows.extend(between);
         phrases.extend(canonical.iter().map(|p| (*p).to_owned()));
         let gap = unit(DIM, rng);
         Self { phrases, rows, things, gap }
