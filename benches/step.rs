@@ -3,9 +3,9 @@
 //! `cargo bench --bench step`. Trains `kitchen-a` from the data folder (`$DIVFF_DATA`, else `../shared/data`), or a scene of its
 //! own where that is absent, on a schedule of `DIVFF_STEPS` steps (1500), and looks at the last of them, where surfaces are sharp.
 //!
-//! The floor counts what cannot be left out: each network forward once where a stream has a density and backward where that is
-//! not faint, the rows of tables that are read and added to there, and moments that change. Rays, placing of samples,
-//! compositing, loss and density grids are not in it.
+//! The floor counts what cannot be left out: the cells of density grids that rays pass, each network forward once where a stream
+//! has a density and backward where that is not faint, the rows of tables that are read and added to there, and moments that
+//! change. Choosing and cutting rays, compositing, loss and what the density grids are told are not in it.
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -33,12 +33,16 @@ const STEPS: usize = 100;
 struct Work {
     flops: f64,
     read_rows: f64,
+    cells: f64,
     added_rows: f64,
     bytes: f64,
 }
 
 impl Work {
     fn add(&mut self, field: &Field, report: &StepReport) {
+        // The actor's grid, which is looked at near the camera only, is left out.
+        let grids = field.nets[..2].iter().flatten().count();
+        self.cells += report.taken as f64 * grids as f64;
         for (s, net) in field.nets.iter().enumerate() {
             let Some(net) = net else { continue };
             let (all, faint) = (report.evaluations[s] as f64, report.faint[s] as f64);
@@ -61,10 +65,11 @@ impl Work {
         }
     }
 
-    /// Least seconds for networks, rows and moments.
-    fn seconds(&self, machine: &Machine, flops: f64) -> [f64; 3] {
+    /// Least seconds for networks, rows, moments and cells.
+    fn seconds(&self, machine: &Machine, flops: f64) -> [f64; 4] {
         let rows = self.read_rows / machine.rows + self.added_rows / machine.added_rows;
-        [self.flops / flops, rows, self.bytes / machine.bytes]
+        // A cell is read as fast as a row, if its grid were in a near cache.
+        [self.flops / flops, rows, self.bytes / machine.bytes, self.cells / machine.rows]
     }
 }
 
@@ -87,12 +92,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     })?;
     let fraction = before as f64 / config.train.steps as f64;
     let (mut times, mut work, mut evaluations) = (Vec::new(), Work::default(), 0);
+    let mut phases = [0.0; 4];
     for _ in 0..STEPS {
         let start = Instant::now();
         let report = trainer.step(fraction, None)?;
         times.push(1e3 * start.elapsed().as_secs_f64());
         work.add(&trainer.trained().field, &report);
         evaluations += report.evaluations.iter().sum::<usize>();
+        (0..4).for_each(|n| phases[n] += 1e3 * report.seconds[n] / STEPS as f64);
     }
     times.sort_by(f64::total_cmp);
 
@@ -113,20 +120,29 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     );
     let mean = |total: f64| total / STEPS as f64;
     println!(
-        "a step: {} evaluations, {:.2} GFLOP, {:.1} M rows read and {:.1} M added to, {:.0} MB of moments",
+        "a step: {} evaluations, {:.2} GFLOP, {:.1} M rows read and {:.1} M added to, {:.0} MB of moments, \
+         {:.1} M cells passed",
         evaluations / STEPS,
         mean(work.flops) / 1e9,
         mean(work.read_rows) / 1e6,
         mean(work.added_rows) / 1e6,
-        mean(work.bytes) / 1e6
+        mean(work.bytes) / 1e6,
+        mean(work.cells) / 1e6
     );
     let parts = work.seconds(&machine, flops).map(|s| 1e3 * mean(s));
     let (floor, median) = (parts.iter().sum::<f64>(), times[STEPS / 2]);
-    println!("floor {floor:.1} ms: networks {:.1}, rows {:.1}, moments {:.1}", parts[0], parts[1], parts[2]);
+    println!(
+        "floor {floor:.1} ms: networks {:.1}, rows {:.1}, moments {:.1}, cells {:.1}",
+        parts[0], parts[1], parts[2], parts[3]
+    );
     println!(
         "time {median:.1} ms (least {:.1}): the floor is {:.0} % of it",
         times[0],
         100.0 * floor / median
+    );
+    println!(
+        "of it, on average: placing {:.1}, encoding {:.1}, evaluating both ways {:.1}, updating {:.1}",
+        phases[0], phases[1], phases[2], phases[3]
     );
     Ok(())
 }

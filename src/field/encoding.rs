@@ -64,44 +64,53 @@ impl Level {
         }
     }
 
-    /// Writes the features of one tile of points to `out`, a row a point.
+    /// Writes the features of `tiles` of points to `out`, a row a point; those that the last tile has too many are left out.
     #[inline(always)]
-    pub fn encode(&self, table: &[Row], pos: &Points, out: &mut [Row]) {
-        match *self {
-            Self::Lattice(ref lattice) => lattice.encode(table, pos, out),
-            Self::Position => {
-                for (s, out) in out.iter_mut().enumerate() {
-                    *out = Row::new(pos[0][s], pos[1][s], pos[2][s], 0.0);
-                }
+    pub fn encode(&self, table: &[Row], tiles: &[Points], out: &mut [Row]) {
+        if let Self::Lattice(lattice) = self {
+            return lattice.encode(table, tiles, out);
+        }
+        for (pos, out) in tiles.iter().zip(out.chunks_mut(TILE)) {
+            if let Self::Waves { axis, half_turns } = *self {
+                waves(&pos[axis], half_turns, out);
+                continue;
             }
-            Self::Waves { axis, half_turns } => waves(&pos[axis], half_turns, out),
+            for (s, out) in out.iter_mut().enumerate() {
+                *out = Row::new(pos[0][s], pos[1][s], pos[2][s], 0.0);
+            }
         }
     }
 
     /// As [`Self::encode`], and each point's derivatives of its features by x, y and z.
     #[inline(always)]
-    pub fn encode_with_slopes(&self, table: &[Row], pos: &Points, out: &mut [Row], slopes: &mut [[Row; 3]]) {
-        match *self {
-            Self::Lattice(ref lattice) => lattice.encode_with_slopes(table, pos, out, slopes),
-            Self::Position => {
-                self.encode(table, pos, out);
-                slopes.fill([Row::X, Row::Y, Row::Z]);
-            }
-            Self::Waves { axis, half_turns } => {
-                waves(&pos[axis], half_turns, out);
-                for (row, slopes) in out.iter().zip(slopes) {
-                    *slopes = [Row::ZERO; 3];
+    pub fn encode_with_slopes(
+        &self,
+        table: &[Row],
+        tiles: &[Points],
+        out: &mut [Row],
+        slopes: &mut [[Row; 3]],
+    ) {
+        if let Self::Lattice(lattice) = self {
+            return lattice.encode_with_slopes(table, tiles, out, slopes);
+        }
+        self.encode(table, tiles, out);
+        for (row, slopes) in out.iter().zip(slopes) {
+            *slopes = match *self {
+                Self::Waves { axis, half_turns } => {
+                    let mut slopes = [Row::ZERO; 3];
                     slopes[axis] = PI * half_turns * Row::new(row.y, -row.x, 2.0 * row.w, -2.0 * row.z);
+                    slopes
                 }
-            }
+                _ => [Row::X, Row::Y, Row::Z],
+            };
         }
     }
 
-    /// Adds the gradients `g` of a tile's features to the rows that they were read from; nothing where none were.
+    /// Adds the gradients `g` of the features of `tiles` to the rows that they were read from; nothing where none were.
     #[inline(always)]
-    pub fn scatter(&self, grads: &mut [Row], pos: &Points, g: &[Row]) {
+    pub fn scatter(&self, grads: &mut [Row], tiles: &[Points], g: &[Row]) {
         if let Self::Lattice(lattice) = self {
-            lattice.scatter(grads, pos, g);
+            lattice.scatter(grads, tiles, g);
         }
     }
 }
@@ -164,7 +173,7 @@ mod tests {
             let pos = tile(seed);
             for (n, level) in encoding.levels.iter().enumerate() {
                 let mut rows = [Row::ZERO; TILE];
-                level.encode(&[], &pos, &mut rows);
+                level.encode(&[], &[pos], &mut rows);
                 for (lane, row) in rows.iter().enumerate() {
                     let truth = &defined(at(&pos, lane))[n * FEATURES..];
                     for (a, b) in row.to_array().iter().zip(truth) {
@@ -182,9 +191,9 @@ mod tests {
         let pos = tile(100);
         for (n, level) in encoding.levels.iter().enumerate() {
             let (mut rows, mut slopes) = ([Row::ZERO; TILE], [[Row::ZERO; 3]; TILE]);
-            level.encode_with_slopes(&[], &pos, &mut rows, &mut slopes);
+            level.encode_with_slopes(&[], &[pos], &mut rows, &mut slopes);
             let mut plain = [Row::ZERO; TILE];
-            level.encode(&[], &pos, &mut plain);
+            level.encode(&[], &[pos], &mut plain);
             assert_eq!(rows, plain);
             for (lane, slopes) in slopes.iter().enumerate() {
                 for (axis, slope) in slopes.iter().enumerate() {
@@ -210,7 +219,7 @@ mod tests {
         for x in [1e3, -1e3, 1e9, f32::MAX, f32::MIN, f32::INFINITY, f32::NAN] {
             for level in &Encoding::frequency(BANDS).levels[1..] {
                 let mut rows = [Row::ZERO; TILE];
-                level.encode(&[], &[[x; TILE]; AXES], &mut rows);
+                level.encode(&[], &[[[x; TILE]; AXES]], &mut rows);
                 assert!(x.is_nan() || rows[0].abs().max_element() < 1.001, "{x}: {}", rows[0]);
             }
         }

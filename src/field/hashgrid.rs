@@ -7,10 +7,13 @@
 
 use glam::{Vec3, Vec4};
 
-use crate::simd::{TILE, floor_within};
+use crate::simd::{TILE, floor_within, prefetch};
 
 /// Features per level: one 16-byte row.
 pub const FEATURES: usize = 4;
+
+/// Points from one that is looked up to the one whose rows are asked for: as many as the processor would not come to by itself.
+const AHEAD: usize = 8;
 
 /// One table row; a `Vec4` rather than an array because the compiler keeps it in one vector register.
 pub type Row = Vec4;
@@ -47,6 +50,18 @@ struct Corners {
     rows: [[u32; TILE]; 8],
     /// `[axis][lane]`, 0–1.
     frac: [[f32; TILE]; 3],
+}
+
+/// The corners around each point of a tile; for a lattice with time those before it and those after it.
+struct Around {
+    before: Corners,
+    after: Corners,
+    /// Share of the latter.
+    fraction: [f32; TILE],
+}
+
+impl Around {
+    const NONE: Self = Self { before: Corners::NONE, after: Corners::NONE, fraction: [0.0; TILE] };
 }
 
 /// Shape of a grid over the box `[0, extent]`.
@@ -137,59 +152,81 @@ impl Lattice {
         Self { scale, time_scale, last_cell, stride, rows, dense }
     }
 
-    /// Writes the features of one tile of points to `out`, a row a point.
+    /// Writes the features of `tiles` of points to `out`, a row a point; those that the last tile has too many are left out.
     #[inline(always)]
-    pub fn encode(&self, table: &[Row], pos: &Points, out: &mut [Row]) {
-        let (corners, after) = self.around(pos);
-        for (s, out) in out.iter_mut().enumerate() {
-            *out = corners.interpolate(table, s).0;
-        }
-        if let Some((corners, fraction)) = after {
+    pub fn encode(&self, table: &[Row], tiles: &[Points], out: &mut [Row]) {
+        let mut around = Around::NONE;
+        for (pos, out) in tiles.iter().zip(out.chunks_mut(TILE)) {
+            self.find(pos, &mut around);
+            let Around { before, after, fraction } = &around;
             for (s, out) in out.iter_mut().enumerate() {
-                *out += (corners.interpolate(table, s).0 - *out) * fraction[s];
+                before.fetch(table, s + AHEAD);
+                *out = before.interpolate(table, s).0;
+            }
+            if self.has_time() {
+                for (s, out) in out.iter_mut().enumerate() {
+                    after.fetch(table, s + AHEAD);
+                    *out += (after.interpolate(table, s).0 - *out) * fraction[s];
+                }
             }
         }
     }
 
     /// As [`Self::encode`], and each point's derivatives of its features by x, y and z.
     #[inline(always)]
-    pub fn encode_with_slopes(&self, table: &[Row], pos: &Points, out: &mut [Row], slopes: &mut [[Row; 3]]) {
-        let (corners, after) = self.around(pos);
-        for (s, (out, slopes)) in out.iter_mut().zip(slopes).enumerate() {
-            let (mut value, mut by) = corners.interpolate(table, s);
-            if let Some((corners, fraction)) = &after {
-                let (then, by_then) = corners.interpolate(table, s);
-                value += (then - value) * fraction[s];
-                (0..3).for_each(|k| by[k] += (by_then[k] - by[k]) * fraction[s]);
+    pub fn encode_with_slopes(
+        &self,
+        table: &[Row],
+        tiles: &[Points],
+        out: &mut [Row],
+        slopes: &mut [[Row; 3]],
+    ) {
+        let mut around = Around::NONE;
+        for (pos, (out, slopes)) in tiles.iter().zip(out.chunks_mut(TILE).zip(slopes.chunks_mut(TILE))) {
+            self.find(pos, &mut around);
+            for (s, (out, slopes)) in out.iter_mut().zip(slopes).enumerate() {
+                let (mut value, mut by) = around.before.interpolate(table, s);
+                if self.has_time() {
+                    let fraction = around.fraction[s];
+                    let (then, by_then) = around.after.interpolate(table, s);
+                    value += (then - value) * fraction;
+                    (0..3).for_each(|k| by[k] += (by_then[k] - by[k]) * fraction);
+                }
+                *out = value;
+                *slopes = std::array::from_fn(|k| by[k] * self.scale[k]);
             }
-            *out = value;
-            *slopes = std::array::from_fn(|k| by[k] * self.scale[k]);
         }
     }
 
-    /// The corners around each point; for a lattice with time those before it, and those after it with the share of the
-    /// latter.
+    /// Whether it spans time, too.
+    fn has_time(&self) -> bool {
+        self.time_scale != 0.0
+    }
+
+    /// Finds what is around each point of a tile.
     #[inline(always)]
-    fn around(&self, pos: &Points) -> (Corners, Option<(Corners, [f32; TILE])>) {
-        if self.time_scale == 0.0 {
-            return (self.corners(pos, &[0; TILE]), None);
+    fn find(&self, pos: &Points, around: &mut Around) {
+        let Around { before, after, fraction } = around;
+        if !self.has_time() {
+            return self.corners(pos, &[0; TILE], before);
         }
-        let (mut before, mut after, mut fraction) = ([0; TILE], [0; TILE], [0.0; TILE]);
+        let mut layers = [[0; TILE]; 2];
         for s in 0..TILE {
             let q = pos[TIME][s] * self.time_scale;
             let (index, cell) = floor_within(q, self.last_cell[TIME] as f32);
-            before[s] = index.wrapping_mul(self.stride[TIME]);
-            after[s] = (index + 1).wrapping_mul(self.stride[TIME]);
+            layers[0][s] = index.wrapping_mul(self.stride[TIME]);
+            layers[1][s] = (index + 1).wrapping_mul(self.stride[TIME]);
             fraction[s] = (q - cell).clamp(0.0, 1.0);
         }
-        (self.corners(pos, &before), Some((self.corners(pos, &after), fraction)))
+        self.corners(pos, &layers[0], before);
+        self.corners(pos, &layers[1], after);
     }
 
     /// The corners in space around each point, in the layer of time that begins at `layer` (times its stride).
     #[inline(always)]
-    fn corners(&self, pos: &Points, layer: &[u32; TILE]) -> Corners {
+    fn corners(&self, pos: &Points, layer: &[u32; TILE], out: &mut Corners) {
         let mut cell = [[0u32; TILE]; 3];
-        let mut frac = [[0.0f32; TILE]; 3];
+        let Corners { rows, frac } = out;
         for axis in 0..3 {
             let (scale, last) = (self.scale[axis], self.last_cell[axis] as f32);
             for s in 0..TILE {
@@ -200,7 +237,6 @@ impl Lattice {
                 frac[axis][s] = (q - c).clamp(0.0, 1.0);
             }
         }
-        let mut rows = [[0u32; TILE]; 8];
         let (stride, mask) = (self.stride, self.rows as u32 - 1);
         for (n, rows) in rows.iter_mut().enumerate() {
             let [dx, dy, dz] = [n as u32 & 1, n as u32 >> 1 & 1, n as u32 >> 2];
@@ -216,28 +252,44 @@ impl Lattice {
                 };
             }
         }
-        Corners { rows, frac }
     }
 
-    /// Adds the gradients `g` of a tile's features to the rows around its points `pos`, by the weights with which
-    /// they were read.
+    /// Adds the gradients `g` of the features of `tiles` to the rows around their points, by the weights with which they were
+    /// read.
     #[inline(always)]
-    pub fn scatter(&self, grads: &mut [Row], pos: &Points, g: &[Row]) {
-        match self.around(pos) {
-            (corners, None) => corners.scatter(grads, g, |_| 1.0),
-            (before, Some((after, fraction))) => {
+    pub fn scatter(&self, grads: &mut [Row], tiles: &[Points], g: &[Row]) {
+        let mut around = Around::NONE;
+        for (pos, g) in tiles.iter().zip(g.chunks(TILE)) {
+            self.find(pos, &mut around);
+            let Around { before, after, fraction } = &around;
+            if self.has_time() {
                 before.scatter(grads, g, |s| 1.0 - fraction[s]);
                 after.scatter(grads, g, |s| fraction[s]);
+            } else {
+                before.scatter(grads, g, |_| 1.0);
             }
         }
     }
 }
 
 impl Corners {
+    const NONE: Self = Self { rows: [[0; TILE]; 8], frac: [[0.0; TILE]; 3] };
+
+    /// Asks for the rows around the point of lane `s`, if there is one, before they are needed.
+    #[inline(always)]
+    fn fetch(&self, table: &[Row], s: usize) {
+        if let (true, Some(first)) = (s < TILE, table.first()) {
+            for rows in &self.rows {
+                prefetch(first, rows[s] as usize * size_of::<Row>());
+            }
+        }
+    }
+
     /// Adds `g`, times `share` of its lane, to the rows by the weights with which they are read.
     #[inline(always)]
     fn scatter(&self, grads: &mut [Row], g: &[Row], share: impl Fn(usize) -> f32) {
         for (s, g) in g.iter().enumerate() {
+            self.fetch(grads, s + AHEAD);
             let g = *g * share(s);
             let (fx, fy, fz) = (self.frac[0][s], self.frac[1][s], self.frac[2][s]);
             let (g1, g0) = (g * fz, g * (1.0 - fz));

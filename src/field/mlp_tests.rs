@@ -66,12 +66,13 @@ impl WithSimd for Pass<'_> {
             values.extend_from_slice(a.output(n));
         }
         let mut gradients = Vec::new();
+        net.reserve_backward(TILES, &mut a);
         for n in 0..TILES {
-            a.output_grad(n).copy_from_slice(&grads[n * rows + output..(n + 1) * rows]);
+            a.output_grad().copy_from_slice(&grads[n * rows + output..(n + 1) * rows]);
             net.backward(simd, &unit, &packed, &mut a, n);
-            gradients.extend_from_slice(a.input_grad(n));
+            gradients.extend_from_slice(a.input_grad());
         }
-        net.accumulate(simd, &unit, &packed, &mut a, TILES, &mut sums);
+        net.finish(simd, &packed, &mut a, &mut sums);
         Outcome { values, gradients, params: sums }
     }
 }
@@ -95,6 +96,22 @@ impl Case {
             grads[(n * rows + output) * TILE..(n + 1) * rows * TILE].fill_with(&mut number);
         }
         Self { net, params, tiles, grads }
+    }
+
+    /// The same with one of its tiles as the first.
+    fn tile(&self, tile: usize) -> Self {
+        let floats = self.net.rows() * TILE;
+        let first = |all: &AlignedVec| {
+            let mut moved = AlignedVec::zeros(all.len());
+            moved[..floats].copy_from_slice(&all[tile * floats..][..floats]);
+            moved
+        };
+        Self {
+            net: self.net.clone(),
+            params: self.params.clone(),
+            tiles: first(&self.tiles),
+            grads: first(&self.grads),
+        }
     }
 
     /// Activations and gradients of one sample in f64; adds its parameter gradients to `sums`.
@@ -211,6 +228,56 @@ fn the_scalar_fallback_matches_the_hosts_instructions() {
         for (a, b) in host.params.iter().zip(&plain.params) {
             close(*a, f64::from(*b), "parameter gradient");
         }
+    }
+}
+
+/// Chunks of some tiles, gone through one after the other before their parameter gradients are asked for.
+struct Chunks<'a>(&'a Case, Precision, &'a [usize]);
+
+impl WithSimd for Chunks<'_> {
+    type Output = Vec<f32>;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Vec<f32> {
+        let Self(case, precision, chunks) = self;
+        let Case { net, params, tiles, grads } = case;
+        let (packed, unit) = (net.pack(params, precision), Unit::Portable);
+        let (rows, input, output) = (net.rows() * TILE, net.input() * TILE, net.output_row() * TILE);
+        let (mut a, mut sums) = (Activations::default(), vec![0.0; net.parameters()]);
+        for &count in chunks {
+            net.reserve(&packed, count, &mut a);
+            for n in 0..count {
+                a.input(n).copy_from_slice(&tiles[n % TILES * rows..][..input]);
+                net.forward(simd, &unit, &packed, &mut a, n);
+            }
+            net.reserve_backward(count, &mut a);
+            for n in 0..count {
+                a.output_grad().copy_from_slice(&grads[n % TILES * rows + output..][..rows - output]);
+                net.backward(simd, &unit, &packed, &mut a, n);
+            }
+        }
+        net.finish(simd, &packed, &mut a, &mut sums);
+        sums
+    }
+}
+
+/// However many tiles chunks have, and whether or not their gradients wait for one another, they are those of the tiles.
+#[test]
+fn gradients_of_chunks_add_up() {
+    // Below and above a strip, at its end, and what is left over.
+    let chunks = [2, 3, 12, 1, 30, 25, 5, 11, 4];
+    for precision in [Precision::F32, Precision::Bf16] {
+        let case = Case::new(SHAPES[2], 7);
+        let together = pulp::Arch::new().dispatch(Chunks(&case, precision, &chunks));
+        let mut alone = vec![0.0f64; case.net.parameters()];
+        for tile in chunks.into_iter().flat_map(|count| 0..count) {
+            let case = case.tile(tile % TILES);
+            let one = pulp::Arch::new().dispatch(Chunks(&case, precision, &[1]));
+            alone.iter_mut().zip(one).for_each(|(sum, g)| *sum += f64::from(g));
+        }
+        let size = alone.iter().map(|g| g * g).sum::<f64>().sqrt();
+        let error = together.iter().zip(&alone).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum::<f64>().sqrt();
+        assert!(error < 1e-5 * size, "{precision:?}: off by {error} of {size}");
     }
 }
 

@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use glam::Vec3;
+use glam::{Mat4, Vec3};
 use pulp::Simd;
 
 use super::config::Widths;
@@ -79,6 +79,13 @@ impl StreamSamples {
     }
 }
 
+/// Four rows of four numbers as columns.
+#[inline(always)]
+fn transposed([a, b, c, d]: [Row; FEATURES]) -> [Row; FEATURES] {
+    let columns = Mat4::from_cols(a, b, c, d).transpose();
+    [columns.x_axis, columns.y_axis, columns.z_axis, columns.w_axis]
+}
+
 /// What one level says about a batch's samples; after the way back, the gradient with respect to it.
 #[derive(Default)]
 pub struct LevelRows {
@@ -92,11 +99,11 @@ impl LevelRows {
     /// Writes the features of tile `tile` to `out`, a row of lanes a feature, as networks read them.
     #[inline(always)]
     pub fn read_tile(&self, tile: usize, out: &mut [f32]) {
-        let rows = &self.rows[tile * TILE..][..TILE];
-        for lane in 0..TILE {
-            let row = rows[lane].to_array();
+        let (rows, _) = self.rows[tile * TILE..][..TILE].as_chunks::<FEATURES>();
+        for (n, rows) in rows.iter().enumerate() {
+            let columns = transposed(*rows);
             for k in 0..FEATURES {
-                out[k * TILE + lane] = row[k];
+                out[k * TILE + n * FEATURES..][..FEATURES].copy_from_slice(&columns[k].to_array());
             }
         }
     }
@@ -105,9 +112,10 @@ impl LevelRows {
     /// [`Self::read_tile`].
     #[inline(always)]
     pub fn write_tile(&mut self, tile: usize, g: &[f32]) {
-        let rows = &mut self.rows[tile * TILE..][..TILE];
-        for lane in 0..TILE {
-            rows[lane] = Row::new(g[lane], g[TILE + lane], g[2 * TILE + lane], g[3 * TILE + lane]);
+        let (rows, _) = self.rows[tile * TILE..][..TILE].as_chunks_mut::<FEATURES>();
+        for (n, rows) in rows.iter_mut().enumerate() {
+            let column = |k: usize| Row::from_slice(&g[k * TILE + n * FEATURES..][..FEATURES]);
+            *rows = transposed([column(0), column(1), column(2), column(3)]);
         }
     }
 }
@@ -162,9 +170,9 @@ impl StreamBatch {
         self.ray.push(ray as u32);
     }
 
-    /// Leaves the samples of whose number in the chunk `keep` is true, encoded as they are.
+    /// Leaves the samples of whose number in the chunk `keep` is true, encoded as they are if they are `encoded`.
     #[inline(always)]
-    pub fn retain(&mut self, keep: impl Fn(usize) -> bool) {
+    fn retain(&mut self, keep: impl Fn(usize) -> bool, encoded: bool) {
         let Self { sample, ray, pos, levels, slopes, kept } = self;
         kept.clear();
         kept.extend((0..sample.len() as u32).filter(|lane| keep(sample[*lane as usize] as usize)));
@@ -179,7 +187,9 @@ impl StreamBatch {
         }
         pos.truncate(tiles);
         for level in levels {
-            compact(&mut level.rows, kept);
+            if encoded {
+                compact(&mut level.rows, kept);
+            }
             level.rows.resize(tiles * TILE, Row::ZERO);
             if *slopes {
                 compact(&mut level.slopes, kept);
@@ -257,16 +267,12 @@ impl LevelTask<'_> {
             out.rows.resize(wanted, Row::ZERO);
         }
         out.rows[lanes..wanted].fill(Row::ZERO);
-        let tiles = pos.iter().zip(out.rows[..lanes].chunks_mut(TILE));
+        let rows = &mut out.rows[..lanes];
         if slopes {
-            out.slopes.resize(pos.len() * TILE, [Row::ZERO; 3]);
-            for ((pos, rows), slopes) in tiles.zip(out.slopes.chunks_mut(TILE)) {
-                level.encode_with_slopes(table, pos, rows, slopes);
-            }
+            out.slopes.resize(wanted, [Row::ZERO; 3]);
+            level.encode_with_slopes(table, pos, rows, &mut out.slopes);
         } else {
-            for (pos, rows) in tiles {
-                level.encode(table, pos, rows);
-            }
+            level.encode(table, pos, rows);
         }
     }
 }
@@ -276,6 +282,14 @@ impl LevelTask<'_> {
 pub struct StreamActivations {
     trunk: Activations,
     head: Activations,
+}
+
+impl StreamActivations {
+    /// Forgets gradients that nobody has asked for.
+    pub fn clear(&mut self) {
+        self.trunk.clear();
+        self.head.clear();
+    }
 }
 
 impl StreamNet {
@@ -297,7 +311,8 @@ impl StreamNet {
         }
     }
 
-    /// Evaluates all samples of an encoded `batch`; `code` and `view` give the conditioning of a ray.
+    /// Evaluates all samples of an encoded `batch`; `code` and `view` give the conditioning of a ray. `known`: what
+    /// [`Self::density_first`] said of them is used again.
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
     pub fn forward<'c, S: Simd>(
@@ -306,16 +321,22 @@ impl StreamNet {
         w: &StreamWeights,
         batch: &StreamBatch,
         activations: &mut StreamActivations,
+        known: bool,
         code: impl Fn(usize) -> &'c [f32],
         view: impl Fn(usize) -> &'c [f32],
         out: &mut StreamSamples,
     ) {
         let unit = Unit::detect();
         let StreamActivations { trunk, head } = activations;
-        self.trunk.reserve(w.trunk, batch.pos.len(), trunk);
+        let known = known && w.trunk.keeps_tiles();
+        if !known {
+            self.trunk.reserve(w.trunk, batch.pos.len(), trunk);
+        }
         self.head.reserve(w.head, batch.pos.len(), head);
         for (n, lanes) in batch.sample.chunks(TILE).enumerate() {
-            self.trunk_forward(simd, &unit, w, batch, n, trunk, n, &code, self.trunk.output());
+            if !known {
+                self.trunk_forward(simd, &unit, w, batch, n, trunk, n, &code, self.trunk.output());
+            }
             let geometry = trunk.output(n);
             let (features, rest) = head.input(n).split_at_mut(geometry.len());
             features.copy_from_slice(geometry);
@@ -359,9 +380,55 @@ impl StreamNet {
         self.trunk.reserve(w.trunk, 1, trunk);
         for (n, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
             self.trunk_forward(simd, &unit, w, batch, n, trunk, 0, &code, 1);
-            for (o, r) in out.iter_mut().zip(trunk.output(0)) {
-                *o = simd::exp((*r + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
-            }
+            self.read_densities(trunk.output(0), out);
+        }
+    }
+
+    /// As [`Self::density`], for a batch of which some samples, by [`Self::retain`], will go through [`Self::forward`].
+    #[inline(always)]
+    pub fn density_first<'c, S: Simd>(
+        &self,
+        simd: S,
+        w: &StreamWeights,
+        batch: &StreamBatch,
+        activations: &mut StreamActivations,
+        code: impl Fn(usize) -> &'c [f32],
+        out: &mut [f32],
+    ) {
+        if !w.trunk.keeps_tiles() {
+            return self.density(simd, w, batch, activations, code, out);
+        }
+        let unit = Unit::detect();
+        let trunk = &mut activations.trunk;
+        self.trunk.reserve(w.trunk, batch.pos.len(), trunk);
+        for (n, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
+            self.trunk_forward(simd, &unit, w, batch, n, trunk, n, &code, self.trunk.output());
+            self.read_densities(trunk.output(n), out);
+        }
+    }
+
+    /// Leaves the samples of `batch` of whose number in the chunk `keep` is true, with what [`Self::density_first`] has found
+    /// out about them.
+    #[inline(always)]
+    pub fn retain(
+        &self,
+        w: &StreamWeights,
+        batch: &mut StreamBatch,
+        activations: &mut StreamActivations,
+        keep: impl Fn(usize) -> bool,
+    ) {
+        // Networks that keep their tiles have read the encoding.
+        batch.retain(keep, !w.trunk.keeps_tiles());
+        if w.trunk.keeps_tiles() {
+            self.trunk.retain(&mut activations.trunk, &batch.kept);
+        }
+    }
+
+    /// Densities of one tile by the output rows of its trunk.
+    #[inline(always)]
+    fn read_densities(&self, raw: &[f32], out: &mut [f32]) {
+        for (o, r) in out.iter_mut().zip(raw) {
+            *o = simd::exp((*r + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
         }
     }
 
@@ -390,9 +457,8 @@ impl StreamNet {
 
     /// Back-propagates through the evaluation that [`Self::forward`] left in `activations`.
     ///
-    /// `values` are its outputs, `grad` the loss's gradient with respect to them. Adds the parameter gradients of trunk
-    /// and head to `trunk_grad` and `head_grad`, replaces the encoding in `batch` by the gradient with respect to it,
-    /// and calls `code(ray, component, gradient)` for every run of lanes of a ray and, if the batch has slopes,
+    /// `values` are its outputs, `grad` the loss's gradient with respect to them. Keeps the parameter gradients of trunk
+    /// and head for [`Self::finish`], replaces the encoding in `batch` by the gradient with respect to it, and calls `code(ray, component, gradient)` for every run of lanes of a ray and, if the batch has slopes,
     /// `position(ray, sample, gradient)` for every lane.
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
@@ -404,13 +470,15 @@ impl StreamNet {
         activations: &mut StreamActivations,
         values: &StreamSamples,
         grad: &StreamSamples,
-        [trunk_grad, head_grad]: [&mut [f32]; 2],
         mut code: impl FnMut(usize, usize, f32),
         mut position: impl FnMut(usize, usize, Vec3),
     ) {
         let unit = Unit::detect();
         let StreamActivations { trunk, head } = activations;
         let StreamBatch { sample, ray, levels, slopes, .. } = batch;
+        let tiles = sample.len().div_ceil(TILE);
+        self.trunk.reserve_backward(tiles, trunk);
+        self.head.reserve_backward(tiles, head);
         for (n, (lanes, rays)) in sample.chunks(TILE).zip(ray.chunks(TILE)).enumerate() {
             let mut raw = [[0.0; TILE]; 5];
             for (lane, &s) in lanes.iter().enumerate() {
@@ -422,17 +490,17 @@ impl StreamNet {
                 }
                 raw[4][lane] = grad.beta[s] * values.beta[s] * (1.0 - values.beta[s] / BETA_MAX);
             }
-            for (out, raw) in head.output_grad(n).chunks_exact_mut(TILE).zip(&raw[1..]) {
+            for (out, raw) in head.output_grad().chunks_exact_mut(TILE).zip(&raw[1..]) {
                 out.copy_from_slice(raw);
             }
             self.head.backward(simd, &unit, w.head, head, n);
-            let out = trunk.output_grad(n);
-            out.copy_from_slice(&head.input_grad(n)[..self.trunk.output() * TILE]);
+            let out = trunk.output_grad();
+            out.copy_from_slice(&head.input_grad()[..self.trunk.output() * TILE]);
             for (d, raw) in out.iter_mut().zip(&raw[0]) {
                 *d += raw;
             }
             self.trunk.backward(simd, &unit, w.trunk, trunk, n);
-            let (features, rest) = trunk.input_grad(n).split_at(self.encoding.width() * TILE);
+            let (features, rest) = trunk.input_grad().split_at(self.encoding.width() * TILE);
             for (level, g) in levels.iter_mut().zip(features.chunks_exact(FEATURES * TILE)) {
                 level.write_tile(n, g);
             }
@@ -452,9 +520,20 @@ impl StreamNet {
                 }
             }
         }
-        let tiles = sample.len().div_ceil(TILE);
-        self.trunk.accumulate(simd, &unit, w.trunk, trunk, tiles, trunk_grad);
-        self.head.accumulate(simd, &unit, w.head, head, tiles, head_grad);
+    }
+
+    /// Adds the parameter gradients of trunk and head of all batches that have gone [`Self::backward`] to `trunk_grad` and
+    /// `head_grad`.
+    #[inline(always)]
+    pub fn finish<S: Simd>(
+        &self,
+        simd: S,
+        w: &StreamWeights,
+        activations: &mut StreamActivations,
+        [trunk_grad, head_grad]: [&mut [f32]; 2],
+    ) {
+        self.trunk.finish(simd, w.trunk, &mut activations.trunk, trunk_grad);
+        self.head.finish(simd, w.head, &mut activations.head, head_grad);
     }
 }
 
@@ -464,9 +543,22 @@ fn condition<'c>(rows: &mut [f32], width: usize, rays: &[u32], of: impl Fn(usize
     if width == 0 {
         return;
     }
-    for (ray, run) in runs(rays) {
-        for (row, v) in rows.chunks_exact_mut(TILE).zip(&of(ray)[..width]) {
-            row[run.clone()].fill(*v);
+    let whole = width - width % FEATURES;
+    for (n, rays) in rays.chunks(FEATURES).enumerate() {
+        // Lanes behind the last are nobody's.
+        let of: [_; FEATURES] = std::array::from_fn(|k| of(rays[k.min(rays.len() - 1)] as usize));
+        let first = n * FEATURES;
+        for k in (0..whole).step_by(FEATURES) {
+            let at = |lane: usize| Row::from_slice(&of[lane][k..][..FEATURES]);
+            let columns = transposed([at(0), at(1), at(2), at(3)]);
+            for row in 0..FEATURES {
+                rows[(k + row) * TILE + first..][..FEATURES].copy_from_slice(&columns[row].to_array());
+            }
+        }
+        for k in whole..width {
+            for lane in 0..FEATURES {
+                rows[k * TILE + first + lane] = of[lane][k];
+            }
         }
     }
 }
@@ -495,6 +587,7 @@ pub struct StreamRanges {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::field::mlp::Precision;
     use crate::field::{EncodingKind, Field, Stream};
     use crate::rng::Rng;
     use crate::train::testing;
@@ -526,7 +619,7 @@ mod tests {
             for slopes in [false, true] {
                 let keep = |n: usize| n % every == every - 1;
                 let mut batch = encoded(0..200, slopes);
-                batch.retain(keep);
+                batch.retain(keep, true);
                 let alone = encoded((0..200).filter(|n| keep(*n)), slopes);
                 assert_eq!((&batch.sample, &batch.ray), (&alone.sample, &alone.ray));
                 assert_eq!(batch.pos.len(), alone.pos.len());
@@ -536,6 +629,59 @@ mod tests {
                     let lanes = if slopes { batch.len() } else { 0 };
                     assert_eq!(a.slopes[..lanes], b.slopes[..lanes]);
                 }
+            }
+        }
+    }
+
+    /// What a stream says of the samples `keep` of a batch, first asked for the density of all of them or not.
+    struct Said<'a> {
+        field: &'a Field,
+        precision: Precision,
+        keep: fn(usize) -> bool,
+        first: bool,
+    }
+
+    impl pulp::WithSimd for Said<'_> {
+        type Output = StreamSamples;
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, simd: S) -> StreamSamples {
+            let Self { field, precision, keep, first } = self;
+            let (net, r) =
+                (field.net(Stream::Dynamic).expect("all streams are on"), &field.layout.streams[1]);
+            let [trunk, head] = [(&net.trunk, &r.trunk), (&net.head, &r.head)]
+                .map(|(net, range)| net.pack(&field.weights[range.clone()], precision));
+            let w = StreamWeights { tables: &field.tables[1], trunk: &trunk, head: &head };
+            let (mut activations, mut out) = (StreamActivations::default(), StreamSamples::default());
+            out.reset(COUNT);
+            let (code, view) = (|_: usize| &[0.3; 64][..], |_: usize| &[0.2; 64][..]);
+            let mut batch = encoded((0..COUNT).filter(|n| first || keep(*n)), false);
+            if first {
+                let mut sigma = vec![0.0; COUNT];
+                net.density_first(simd, &w, &batch, &mut activations, code, &mut sigma);
+                net.retain(&w, &mut batch, &mut activations, keep);
+            }
+            net.forward(simd, &w, &batch, &mut activations, first, code, view, &mut out);
+            out
+        }
+    }
+
+    /// Samples of a batch.
+    const COUNT: usize = 200;
+
+    #[test]
+    fn what_is_known_by_its_density_says_the_same() {
+        let mut field = Field::zeros(testing::shape(&testing::config_of(EncodingKind::Hash)));
+        let mut rng = Rng::new(4, 0, 0);
+        field.weights.iter_mut().for_each(|w| *w = rng.uniform() - 0.5);
+        let keeps: [fn(usize) -> bool; 4] = [|_| false, |n| n % 90 == 7, |n| n % 3 > 0, |_| true];
+        for precision in [Precision::F32, Precision::Bf16] {
+            for keep in keeps {
+                let said = |first| {
+                    let out = pulp::Arch::new().dispatch(Said { field: &field, precision, keep, first });
+                    (out.sigma, out.rgb, out.beta)
+                };
+                assert_eq!(said(true), said(false));
             }
         }
     }

@@ -2,6 +2,8 @@
 //!
 //! Training and rendering both go through here; training then walks the same buffers backwards.
 
+use std::ops::Range;
+
 use glam::{Vec2, Vec3};
 use pulp::Simd;
 
@@ -129,6 +131,19 @@ struct RayGrids<'a> {
     slices: [usize; 3],
 }
 
+impl RayGrids<'_> {
+    /// Actor coordinates of the points at distances `t`.
+    #[inline(always)]
+    fn actor_points(&self, t: &[f32; STRIDE]) -> [[f32; STRIDE]; 3] {
+        let RayInput { uv, dir_cam, .. } = *self.input;
+        let mut points = [[uv.x; STRIDE], [uv.y; STRIDE], [0.0; STRIDE]];
+        for n in 0..STRIDE {
+            points[2][n] = self.model.actor_point(uv, t[n] * dir_cam.z).z;
+        }
+        points
+    }
+}
+
 impl Steer for RayGrids<'_> {
     #[inline(always)]
     fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
@@ -143,10 +158,7 @@ impl Steer for RayGrids<'_> {
         }
         let (z, far) = (input.dir_cam.z, model.field.actor_far);
         if model.streams[2] && t[0] * z < far {
-            let mut points = [[input.uv.x; STRIDE], [input.uv.y; STRIDE], [0.0; STRIDE]];
-            for n in 0..STRIDE {
-                points[2][n] = model.actor_point(input.uv, t[n] * z).z;
-            }
+            let points = self.actor_points(t);
             let mut sigma = [0.0; STRIDE];
             actor.add_at(&points, slices[2], &mut sigma);
             for n in 0..STRIDE {
@@ -275,20 +287,23 @@ impl Chunk {
     ) {
         self.place(tracer, model, views, inputs, sampling);
         self.encode(model);
-        self.find_densities(simd, tracer, model);
+        self.find_densities(simd, tracer, model, false);
         self.weigh(sampling.count);
     }
 
-    /// Densities at all samples of the batches, and nothing else of the streams.
+    /// Densities at all samples of the batches, and nothing else of the streams unless their colours are asked for later.
     #[inline(always)]
-    fn find_densities<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model) {
+    fn find_densities<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, colours: bool) {
         let Self { codes, intervals, batches, .. } = self;
         let Tracer { sigma, activations, .. } = tracer;
         for s in 0..3 {
             let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
             sigma.resize(batches[s].len(), 0.0);
             let code = |r: usize| &codes[s][r * net.code..];
-            net.density(simd, &w, &batches[s], &mut activations[s], code, sigma);
+            match colours {
+                true => net.density_first(simd, &w, &batches[s], &mut activations[s], code, sigma),
+                false => net.density(simd, &w, &batches[s], &mut activations[s], code, sigma),
+            }
             for (&k, sigma) in batches[s].sample.iter().zip(&*sigma) {
                 intervals[k as usize].sigma[s] = *sigma;
             }
@@ -321,24 +336,33 @@ impl Chunk {
     /// colour and uncertainty count as zero there.
     #[inline(always)]
     pub fn evaluate<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, n: usize, faint: Faint) {
-        if faint.share > 0.0 {
-            self.find_densities(simd, tracer, model);
+        let first = faint.share > 0.0;
+        if first {
+            self.find_densities(simd, tracer, model, true);
             self.weigh(n);
-            for (s, batch) in self.batches.iter_mut().enumerate() {
-                let (intervals, weighted) = (&self.intervals, &self.weighted);
-                batch.retain(|k| !faint.is(s, &intervals[k], &weighted[k]));
-            }
+            self.drop_faint(tracer, model, faint);
         }
-        self.find_colours(simd, tracer, model);
-        if faint.share <= 0.0 {
+        self.find_colours(simd, tracer, model, first);
+        if !first {
             self.weigh(n);
         }
         self.composite(n);
     }
 
-    /// What the streams say at the samples of their batches.
+    /// Has samples that are faint leave the batches.
     #[inline(always)]
-    fn find_colours<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model) {
+    fn drop_faint(&mut self, tracer: &mut Tracer, model: &Model, faint: Faint) {
+        let Self { intervals, weighted, batches, .. } = self;
+        for (s, batch) in batches.iter_mut().enumerate() {
+            let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
+            let keep = |k: usize| !faint.is(s, &intervals[k], &weighted[k]);
+            net.retain(&w, batch, &mut tracer.activations[s], keep);
+        }
+    }
+
+    /// What the streams say at the samples of their batches; `known`: after [`Self::find_densities`] for colours.
+    #[inline(always)]
+    fn find_colours<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, known: bool) {
         let Self { codes, rays, intervals, batches, samples, .. } = self;
         for s in 0..3 {
             samples[s].reset(intervals.len());
@@ -348,7 +372,8 @@ impl Chunk {
             }
             let code = |r: usize| &codes[s][r * net.code..];
             let view = |r: usize| &rays[r].view[..];
-            net.forward(simd, &w, &batches[s], &mut tracer.activations[s], code, view, &mut samples[s]);
+            let activations = &mut tracer.activations[s];
+            net.forward(simd, &w, &batches[s], activations, known, code, view, &mut samples[s]);
             for &k in &batches[s].sample {
                 intervals[k as usize].sigma[s] = samples[s].sigma[k as usize];
             }
@@ -413,41 +438,70 @@ impl Chunk {
             let (slice_d, slice_a) = (grid_d.slice(view.time), grid_a.slice(view.time));
             let steer = RayGrids { model, input, slices: [0, slice_d, slice_a] };
             let hit = sampler.edges(&ray, sampling, input.jitter, &steer, edges);
-            for k in 0..n {
-                let sample = r * n + k;
-                if !hit {
-                    self.intervals.push(Interval::default());
-                    continue;
-                }
-                let t = 0.5 * (edges[k] + edges[k + 1]);
-                let delta = edges[k + 1] - edges[k];
-                self.intervals.push(Interval { sigma: [0.0; 3], delta, t });
-                let p = ray.origin + ray.dir * t;
-                if model.streams[0] {
-                    self.push(model, 0, [sample, r], p, view.time, 0);
-                }
-                if model.streams[1] {
-                    self.push(model, 1, [sample, r], p, view.time, slice_d);
-                }
-                let z = t * input.dir_cam.z;
-                if model.streams[2] && z < field.actor_far {
-                    self.push(model, 2, [sample, r], model.actor_point(input.uv, z), view.time, slice_a);
-                }
+            if hit {
+                self.intervals.extend(edges.windows(2).map(|e| Interval {
+                    sigma: [0.0; 3],
+                    delta: e[1] - e[0],
+                    t: 0.5 * (e[0] + e[1]),
+                }));
+                self.place_ray(&steer, &ray, r, view.time, n);
+            } else {
+                self.intervals.resize((r + 1) * n, Interval::default());
             }
             let unit = ray.dir.normalize_or_zero();
             self.rays.push(TracedRay { ray, left: 1.0, rgb: [0.0; 3], beta: 0.0, view: view_encoding(unit) });
         }
     }
 
-    /// Has stream `s` evaluated at `p` and `time`, in slice `slice` of its density grid, unless the grid says that nothing is
-    /// there.
+    /// Has the streams evaluated at the `count` samples of ray number `r` where the density grids say that something is there.
     #[inline(always)]
-    fn push(&mut self, model: &Model, s: usize, [sample, ray]: [usize; 2], p: Vec3, time: f32, slice: usize) {
+    fn place_ray(&mut self, grids: &RayGrids, ray: &Ray, r: usize, time: f32, count: usize) {
+        let (model, dir_cam) = (grids.model, grids.input.dir_cam);
+        let far = model.field.actor_far;
+        for first in (r * count..(r + 1) * count).step_by(STRIDE) {
+            let intervals = &self.intervals[first..self.intervals.len().min(first + STRIDE)];
+            let mut t = [0.0; STRIDE];
+            t.iter_mut().zip(intervals).for_each(|(t, i)| *t = i.t);
+            let mut points = [[0.0; STRIDE]; 3];
+            for axis in 0..3 {
+                for n in 0..STRIDE {
+                    points[axis][n] = ray.origin[axis] + ray.dir[axis] * t[n];
+                }
+            }
+            let len = intervals.len();
+            for s in (0..2).filter(|s| model.streams[*s]) {
+                self.push(grids, s, [first, r], &points, time, 0..len);
+            }
+            // Distances increase along the ray.
+            let near = t[..len].partition_point(|t| *t * dir_cam.z < far);
+            if model.streams[2] && near > 0 {
+                let points = grids.actor_points(&t);
+                self.push(grids, 2, [first, r], &points, time, 0..near);
+            }
+        }
+    }
+
+    /// Has stream `s` evaluated at those of the lanes of `points` where its density grid says that something is there; they
+    /// are the samples from number `first` on, of ray number `ray`.
+    #[inline(always)]
+    fn push(
+        &mut self,
+        grids: &RayGrids,
+        s: usize,
+        [first, ray]: [usize; 2],
+        points: &[[f32; STRIDE]; 3],
+        time: f32,
+        lanes: Range<usize>,
+    ) {
+        let model = grids.model;
         let grid = &model.grids.streams[s];
-        let cell = grid.index(p, slice);
-        if grid.sigma[cell] >= model.grids.threshold[s] {
-            self.batches[s].push(sample, ray, p, time);
-            self.cells[s].push(Placed { sample: sample as u32, cell: cell as u32 });
+        let cells = grid.indices(points, grids.slices[s]);
+        for n in lanes {
+            if grid.sigma[cells[n] as usize] >= model.grids.threshold[s] {
+                let p = Vec3::from_array([0, 1, 2].map(|axis| points[axis][n]));
+                self.batches[s].push(first + n, ray, p, time);
+                self.cells[s].push(Placed { sample: (first + n) as u32, cell: cells[n] });
+            }
         }
     }
 }

@@ -114,6 +114,15 @@ impl WithSimd for ColourPass<'_> {
         let view = |n: usize| &views[n][..];
         let mut activations = StreamActivations::default();
         self.query.net.encode(&self.weights, self.batch);
-        self.query.net.forward(simd, &self.weights, self.batch, &mut activations, code, view, self.out);
+        self.query.net.forward(
+            simd,
+            &self.weights,
+            self.batch,
+            &mut activations,
+            false,
+            code,
+            view,
+            self.out,
+        );
     }
 }

@@ -3,7 +3,7 @@
 use super::density_grid::STRIDE;
 use super::rays::Ray;
 
-/// Most steps a ray takes through the density grids.
+/// Most steps a ray takes through the density grids; whole blocks of [`STRIDE`].
 const MAX_STEPS: usize = 768;
 
 /// See [`Sampler`]: a share of the light that does not show.
@@ -34,18 +34,40 @@ pub trait Steer {
     fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2];
 }
 
+/// Products of all factors before each, and of all of them.
+///
+/// Blocks do not wait for one another: what is left before a block comes to it afterwards.
+#[inline(always)]
+fn products(factors: [f32; STRIDE]) -> ([f32; STRIDE], f32) {
+    let (mut before, mut product) = ([0.0; STRIDE], 1.0);
+    for (before, factor) in before.iter_mut().zip(factors) {
+        *before = product;
+        product *= factor;
+    }
+    (before, product)
+}
+
 /// Buffers of one thread.
 pub struct Sampler {
     weights: Vec<f32>,
+    sums: Vec<f32>,
     /// A ray is cut off where what stands leaves less than this of its light.
     saturated: f32,
+    /// Steps through the grids that rays have taken, so far.
+    pub taken: u64,
     /// Steps through the grids that rays were spared because they had been cut off, so far.
     pub spared: u64,
 }
 
 impl Default for Sampler {
     fn default() -> Self {
-        Self { weights: vec![0.0; MAX_STEPS], saturated: SATURATED, spared: 0 }
+        Self {
+            weights: vec![0.0; MAX_STEPS],
+            sums: vec![0.0; MAX_STEPS],
+            saturated: SATURATED,
+            taken: 0,
+            spared: 0,
+        }
     }
 }
 
@@ -58,6 +80,25 @@ impl Sampler {
 }
 
 impl Sampler {
+    /// Sums of the weights of the first `used` steps, each with `floor` more, up to and with every step.
+    #[inline(always)]
+    fn add_up(&mut self, used: usize, floor: f32) {
+        let (weights, sums) = (self.weights.as_chunks::<STRIDE>().0, self.sums.as_chunks_mut::<STRIDE>().0);
+        let mut before = 0.0;
+        for (weights, sums) in weights.iter().zip(sums).take(used.div_ceil(STRIDE)) {
+            // Within the block first, so that blocks do not wait for one another.
+            let mut sum = 0.0;
+            for n in 0..STRIDE {
+                sum += weights[n] + floor;
+                sums[n] = sum;
+            }
+            for s in sums {
+                *s += before;
+            }
+            before += sum;
+        }
+    }
+
     /// Writes `count + 1` increasing distances to `edges`; false if the ray misses the box.
     ///
     /// `jitter` in [0, 1) shifts all edges by a part of one interval's weight.
@@ -77,10 +118,10 @@ impl Sampler {
         let steps = (((end - start) / sampling.step).ceil() as usize).clamp(1, MAX_STEPS);
         let dt = (end - start) / steps as f32;
         let (mut left, mut past) = (1.0f32, 1.0f32);
-        let mut total = 0.0;
+        let mut totals = [0.0; STRIDE];
         let mut used = 0;
         let scale = sampling.sharpness * dt;
-        for weights in self.weights[..steps].chunks_mut(STRIDE) {
+        for block in self.weights.as_chunks_mut::<STRIDE>().0.iter_mut().take(steps.div_ceil(STRIDE)) {
             let mut t = [0.0; STRIDE];
             for (n, t) in t.iter_mut().enumerate() {
                 *t = start + ((used + n) as f32 + 0.5) * dt;
@@ -91,39 +132,60 @@ impl Sampler {
                     points[axis][n] = ray.origin[axis] + ray.dir[axis] * t[n];
                 }
             }
-            let [stands, moves] = steer.sigma(&points, &t);
-            let mut alphas = [[0.0; 3]; STRIDE];
-            for ((a, stands), moves) in alphas.iter_mut().zip(stands).zip(moves) {
-                // 1 - e^-tau to first order, and cheaper; only steers the samples.
-                *a = [stands + moves, stands, moves].map(|sigma| 1.0 - 1.0 / (1.0 + sigma * scale));
+            let [mut stands, mut moves] = steer.sigma(&points, &t);
+            let mut alphas = [0.0; STRIDE];
+            for n in 0..STRIDE {
+                // e^-tau to first order, and cheaper; only steers the samples.
+                let passes = |sigma: f32| 1.0 / (1.0 + sigma * scale);
+                alphas[n] = 1.0 - passes(stands[n] + moves[n]);
+                (stands[n], moves[n]) = (passes(stands[n]), passes(moves[n]));
             }
-            for (w, [alpha, stands, moves]) in weights.iter_mut().zip(alphas) {
-                *w = left * past.max(SEEN_PAST) * alpha;
-                total += *w;
-                left *= 1.0 - stands;
-                past *= 1.0 - moves;
-                used += 1;
-                if left < self.saturated {
-                    break;
-                }
+            let ((stands, all), (moves, all_move)) = (products(stands), products(moves));
+            let mut ahead = [0.0; STRIDE];
+            for n in 0..STRIDE {
+                ahead[n] = left * stands[n];
+                block[n] = ahead[n] * (past * moves[n]).max(SEEN_PAST) * alphas[n];
             }
+            let len = block.len().min(steps - used);
+            (left, past) = (left * all, past * all_move);
+            let mut seen = len;
+            if left < self.saturated {
+                // The step after which nothing is left is the last.
+                seen = ahead[1..len].iter().position(|left| *left < self.saturated).map_or(len, |n| n + 1);
+            }
+            if seen < STRIDE {
+                block[seen..].fill(0.0);
+            }
+            for n in 0..STRIDE {
+                totals[n] += block[n];
+            }
+            used += seen;
             if left < self.saturated {
                 break;
             }
         }
+        self.taken += used as u64;
         self.spared += (steps - used) as u64;
+        let total = totals.iter().sum::<f32>();
         let span = used as f32;
         let floor = sampling.explore * total.max(0.05) / ((1.0 - sampling.explore) * span);
         let total = total + floor * span;
         let n = sampling.count;
-        let (mut bin, mut below) = (0, 0.0);
+        self.add_up(used, floor);
+        let (sums, _) = self.sums.as_chunks::<STRIDE>();
+        let mut block = 0;
         edges[0] = start;
         for (k, edge) in edges[1..n].iter_mut().enumerate() {
             let target = (k as f32 + 0.5 + jitter) / n as f32 * total;
-            while bin + 1 < used && below + self.weights[bin] + floor < target {
-                below += self.weights[bin] + floor;
-                bin += 1;
+            while (block + 1) * STRIDE < used && sums[block][STRIDE - 1] < target {
+                block += 1;
             }
+            let mut bin = block * STRIDE;
+            for sum in &sums[block] {
+                bin += usize::from(*sum < target);
+            }
+            let bin = bin.min(used - 1);
+            let below = if bin > 0 { self.sums[bin - 1] } else { 0.0 };
             let inside = ((target - below) / (self.weights[bin] + floor)).clamp(0.0, 1.0);
             *edge = start + (bin as f32 + inside) * dt;
         }

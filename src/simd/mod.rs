@@ -4,10 +4,11 @@
 //! they need no `unsafe`. Lanes are always samples, never features: every width gives the same forward result
 //! for every sample.
 
+pub mod lanes;
 mod machine;
 pub mod matrix;
 
-pub use machine::prefetch;
+pub use machine::{prefetch, row_sums};
 
 use bytemuck::{Pod, Zeroable};
 use half::f16;
@@ -36,10 +37,11 @@ impl AlignedVec {
         Self { lines: vec![Line([0.0; 16]); len.div_ceil(16)], len }
     }
 
-    /// Grows to at least `len` floats; contents are unspecified afterwards.
+    /// Grows to at least `len` floats; what is new is zero.
     pub fn reserve_len(&mut self, len: usize) {
         if len > self.len {
-            *self = Self::zeros(len);
+            self.lines.resize(len.div_ceil(16), Line([0.0; 16]));
+            self.len = len;
         }
     }
 }

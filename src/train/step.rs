@@ -6,10 +6,13 @@
 //! evaluate the networks, the loss and go backward; levels scatter and update. There are no atomics, and the result
 //! does not depend on the number of threads.
 
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use self::group::{Context, Group};
+use self::group::{Context, Group, Scratch};
 use self::update::update;
 use super::adam::{Moments, TableState};
 use super::loss::LossConfig;
@@ -107,12 +110,16 @@ pub struct StepReport {
     pub candidates: usize,
     /// Samples placed, times streams that the field does not have.
     pub absent: usize,
+    /// Steps through the density grids that rays have taken.
+    pub taken: u64,
     /// Steps through the density grids that rays were spared because nothing was left of their light.
     pub spared: u64,
     /// Evaluations from which no pose was to learn, of those from which one would have.
     pub unrefined: usize,
     /// Number of the first chunk of rays whose loss is not finite.
     pub diverged: Option<usize>,
+    /// Seconds that placing, encoding, evaluating (both ways) and updating took.
+    pub seconds: [f64; 4],
 }
 
 /// All state of training but the field itself.
@@ -122,6 +129,8 @@ pub struct Optimiser {
     /// State of every table `[stream][level]`.
     pub tables: [Vec<TableState>; 3],
     groups: Vec<Group>,
+    /// One a thread.
+    scratch: Vec<Mutex<Scratch>>,
     gradient: Vec<f32>,
 }
 
@@ -132,6 +141,7 @@ impl Optimiser {
             dense: Moments::new(field.layout.len),
             tables: field.tables.each_ref().map(|t| t.iter().map(|t| TableState::new(t.len())).collect()),
             groups: Vec::new(),
+            scratch: Vec::new(),
             gradient: vec![0.0; field.layout.len],
         }
     }
@@ -158,9 +168,12 @@ impl Optimiser {
         seed: u64,
         companion: Option<&dyn Companion>,
     ) -> StepReport {
+        let start = Instant::now();
         let chunks = chunks(plan.rays);
         let rays = chunks * CHUNK_RAYS;
         self.groups.resize_with(chunks.min(GROUPS), Group::default);
+        self.scratch.resize_with(rayon::current_num_threads(), Mutex::default);
+        let scratch = &self.scratch;
         let chunks = chunks / self.groups.len().max(1);
         let mut views: Vec<View> = pixels.frames.iter().map(|f| View::new(field, f)).collect();
         for (n, view) in views.iter_mut().enumerate() {
@@ -171,13 +184,16 @@ impl Optimiser {
         let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays, companion };
         let arch = pulp::Arch::new();
         self.groups.par_iter_mut().enumerate().for_each(|(n, group)| {
-            arch.dispatch(PlacePass { context: &context, group, first_chunk: n * chunks, chunks });
+            arch.dispatch(PlacePass { context: &context, group, scratch, first_chunk: n * chunks, chunks });
         });
+        let placed = Instant::now();
         encode(&mut self.groups, &model);
+        let encoded = Instant::now();
         self.groups.par_iter_mut().for_each(|group| {
-            arch.dispatch(EvaluatePass { context: &context, group });
+            arch.dispatch(EvaluatePass { context: &context, group, scratch });
         });
         drop(model);
+        let evaluated = Instant::now();
         let mut report = StepReport { rays, ..StepReport::default() };
         for g in &self.groups {
             report.loss += g.loss.total / rays as f64;
@@ -186,6 +202,7 @@ impl Optimiser {
                 report.evaluations[s] += g.evaluations[s];
                 report.faint[s] += g.faint[s];
             }
+            report.taken += g.taken;
             report.spared += g.spared;
             report.diverged = report.diverged.or(g.diverged);
         }
@@ -197,8 +214,18 @@ impl Optimiser {
             report.unrefined = (evaluations - faint) / group::REFINE_EVERY as usize;
         }
         update(self, field, grids, plan);
+        let ends = [placed, encoded, evaluated, Instant::now()];
+        let starts = [start, placed, encoded, evaluated];
+        report.seconds = std::array::from_fn(|n| (ends[n] - starts[n]).as_secs_f64());
         report
     }
+}
+
+/// The buffers of the thread that asks, for which nobody else does.
+fn scratch_of(scratch: &[Mutex<Scratch>]) -> MutexGuard<'_, Scratch> {
+    let thread = rayon::current_thread_index().unwrap_or_default() % scratch.len();
+    // Whatever a panic has left there is written before it is read.
+    scratch[thread].lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Encodes the samples of all groups, one level after the other.
@@ -222,6 +249,7 @@ fn encode(groups: &mut [Group], model: &Model) {
 struct PlacePass<'a> {
     context: &'a Context<'a>,
     group: &'a mut Group,
+    scratch: &'a [Mutex<Scratch>],
     first_chunk: usize,
     chunks: usize,
 }
@@ -231,7 +259,7 @@ impl WithSimd for PlacePass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
-        self.group.place(self.context, self.first_chunk, self.chunks);
+        self.group.place(self.context, &mut scratch_of(self.scratch), self.first_chunk, self.chunks);
     }
 }
 
@@ -251,6 +279,7 @@ impl WithSimd for EncodePass<'_> {
 struct EvaluatePass<'a> {
     context: &'a Context<'a>,
     group: &'a mut Group,
+    scratch: &'a [Mutex<Scratch>],
 }
 
 impl WithSimd for EvaluatePass<'_> {
@@ -258,6 +287,6 @@ impl WithSimd for EvaluatePass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        self.group.evaluate(simd, self.context);
+        self.group.evaluate(simd, self.context, &mut scratch_of(self.scratch));
     }
 }

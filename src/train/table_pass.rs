@@ -6,7 +6,6 @@ use super::adam::{StepSize, TableState};
 use crate::field::encoding::Level;
 use crate::field::hashgrid::Row;
 use crate::field::stream::StreamBatch;
-use crate::simd::TILE;
 
 /// Scatters one level's gradients, batch after batch, and updates its table.
 pub struct TablePass<'a, B> {
@@ -31,10 +30,7 @@ impl<'a, B: Iterator<Item = &'a StreamBatch>> WithSimd for TablePass<'_, B> {
     fn with_simd<S: Simd>(self, _simd: S) {
         let Self { batches, number, level, table, state, rate } = self;
         for batch in batches.filter(|b| !b.is_empty()) {
-            let rows = &batch.levels[number].rows[..batch.len()];
-            for (pos, g) in batch.tiles().iter().zip(rows.chunks(TILE)) {
-                level.scatter(&mut state.grad, pos, g);
-            }
+            level.scatter(&mut state.grad, batch.tiles(), &batch.levels[number].rows[..batch.len()]);
         }
         state.update(table, rate);
     }

@@ -2,7 +2,7 @@
 //!
 //! A tile's inputs, outputs and their gradients are f32, feature-major `[features][TILE]`. What lies between is the
 //! business of the arithmetic: `vector` computes in f32, `matrix` multiplies in bf16 and sums in f32. Both keep a
-//! chunk's activations together, so that the weight gradients are one product over all its samples.
+//! chunk's activations together, so that the weight gradients are products over many of its samples.
 
 mod matrix;
 mod vector;
@@ -11,6 +11,7 @@ use pulp::Simd;
 use serde::{Deserialize, Serialize};
 
 use self::vector::TileView;
+use crate::simd::lanes::{self, Layout};
 use crate::simd::matrix::{Unit, available};
 use crate::simd::{AlignedVec, TILE};
 
@@ -23,6 +24,10 @@ const BLOCK: usize = 4;
 /// longer for a product with one. This is a thousandth of Adam's ε and its square is still a normal number, after any
 /// network's weights have made it smaller.
 const LEAST_GRADIENT: f32 = 1e-18;
+
+/// Most tiles whose gradients are kept until those of the weights are summed: with what was evaluated there, they stay near
+/// the core, and a sum over fewer would not be worth its end.
+const STRIP: usize = 12;
 
 /// What the networks are multiplied in. Weights, sums, gradients and everything else are f32 in any case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -143,7 +148,7 @@ impl Mlp {
         let floats = match packed {
             Packed::Vector(_) => {
                 a.stride = self.rows() * TILE;
-                a.stride * tiles
+                a.stride * (a.waiting + tiles)
             }
             Packed::Matrix(packed) => {
                 a.stride = 0;
@@ -152,8 +157,19 @@ impl Mlp {
             }
         };
         a.end = if a.stride > 0 { a.stride } else { floats };
+        a.first = a.waiting;
         a.values.reserve_len(floats);
-        a.grads.reserve_len(floats);
+    }
+
+    /// Makes room for the way back through the first `tiles` of the evaluated tiles.
+    pub fn reserve_backward(&self, tiles: usize, a: &mut Activations) {
+        a.tiles = tiles;
+        // As many in every strip, since the sums at the end of one take time.
+        let all = a.waiting + tiles;
+        a.strip = if all < STRIP { STRIP } else { all.div_ceil(all.div_ceil(STRIP)) };
+        let kept = a.strip.min(all).max(a.waiting + 1);
+        a.grads.reserve_len((kept * a.stride).max(a.end));
+        a.sums.resize(self.parameters(), 0.0);
     }
 
     /// From the input rows of tile `n` to its output rows.
@@ -173,7 +189,7 @@ impl Mlp {
         n: usize,
         outputs: usize,
     ) {
-        let tile = &mut a.values[n * a.stride..][..a.end];
+        let tile = &mut a.values[(a.first + n) * a.stride..][..a.end];
         match packed {
             Packed::Vector(packed) => {
                 packed.forward(simd, &self.layers, tile, outputs.next_multiple_of(BLOCK));
@@ -182,40 +198,63 @@ impl Mlp {
         }
     }
 
-    /// From the gradient of the output rows of tile `n` to that of its input rows.
+    /// Leaves the samples `kept`, in increasing order, of evaluated tiles, as if there had been nothing else; only where
+    /// [`Packed::keeps_tiles`].
+    pub fn retain(&self, a: &mut Activations, kept: &[u32]) {
+        let values = &mut a.values[a.first * a.stride..];
+        lanes::keep(values, Layout { rows: self.rows(), stride: a.stride }, kept);
+    }
+
+    /// From the gradient of the output rows of tile `n` to that of its input rows, tile after tile; the parameters' gradients
+    /// are kept until [`Self::finish`].
     #[inline(always)]
     pub fn backward<S: Simd>(&self, simd: S, unit: &Unit, packed: &Packed, a: &mut Activations, n: usize) {
-        let grad = &mut a.grads[n * a.stride..][..a.end];
+        let last = n + 1 == a.tiles;
+        a.latest = a.waiting;
+        let grad = &mut a.grads[a.waiting * a.stride..][..a.end];
         for g in &mut grad[a.end - a.output..] {
             *g = if g.abs() < LEAST_GRADIENT { 0.0 } else { *g };
         }
         match packed {
             Packed::Vector(packed) => {
-                packed.backward(simd, &self.layers, &a.values[n * a.stride..][..a.end], grad);
+                let at = a.first + n;
+                packed.backward(simd, &self.layers, &a.values[at * a.stride..][..a.end], grad);
+                a.waiting += 1;
+                // Those of a chunk that begins a strip may wait for the next chunk; others are not where it will be.
+                if a.waiting >= a.strip || last && a.waiting <= n {
+                    self.sum(simd, a, at + 1 - a.waiting);
+                }
             }
-            Packed::Matrix(packed) => packed.backward(unit, &self.layers, grad, &mut a.saved, n),
+            Packed::Matrix(packed) => {
+                packed.backward(unit, &self.layers, grad, &mut a.saved, n);
+                if last {
+                    packed.accumulate(unit, &self.layers, &mut a.saved, a.tiles, &mut a.sums);
+                }
+            }
         }
     }
 
-    /// Adds the parameter gradients of the first `tiles` tiles to `out` (same order as the parameters), after
-    /// [`Self::backward`] of each.
+    /// Sums the gradients of the tiles that wait for it, the first of which is number `first` of those kept.
     #[inline(always)]
-    pub fn accumulate<S: Simd>(
-        &self,
-        simd: S,
-        unit: &Unit,
-        packed: &Packed,
-        a: &mut Activations,
-        tiles: usize,
-        out: &mut [f32],
-    ) {
-        match packed {
-            Packed::Vector(_) => {
-                let view = |data| TileView { data, stride: a.stride, offset: 0 };
-                vector::accumulate(simd, &self.layers, view(&a.values), view(&a.grads), tiles, out);
-            }
-            Packed::Matrix(packed) => packed.accumulate(unit, &self.layers, &mut a.saved, tiles, out),
+    fn sum<S: Simd>(&self, simd: S, a: &mut Activations, first: usize) {
+        let view = |data| TileView { data, stride: a.stride, offset: 0 };
+        let (values, grads) = (view(&a.values[first * a.stride..]), view(&a.grads));
+        vector::accumulate(simd, &self.layers, values, grads, a.waiting, &mut a.sums);
+        a.waiting = 0;
+    }
+
+    /// Adds the parameter gradients of all tiles that have gone [`Self::backward`] to `out`, in the order of the parameters.
+    #[inline(always)]
+    pub fn finish<S: Simd>(&self, simd: S, packed: &Packed, a: &mut Activations, out: &mut [f32]) {
+        if a.waiting > 0 {
+            self.sum(simd, a, 0);
         }
+        match packed {
+            _ if a.sums.is_empty() => {}
+            Packed::Vector(_) => vector::unpack(&self.layers, &a.sums, out),
+            Packed::Matrix(_) => out.iter_mut().zip(&a.sums).for_each(|(out, sum)| *out += sum),
+        }
+        a.sums.clear();
     }
 }
 
@@ -255,6 +294,13 @@ pub enum Packed {
     Matrix(matrix::Packed),
 }
 
+impl Packed {
+    /// Whether every tile's inputs and outputs stay after others have been evaluated.
+    pub fn keeps_tiles(&self) -> bool {
+        matches!(self, Self::Vector(_))
+    }
+}
+
 /// Activations of a chunk of tiles, and their gradients.
 #[derive(Default)]
 pub struct Activations {
@@ -264,6 +310,16 @@ pub struct Activations {
     /// Floats from one tile to the next, and of one tile.
     stride: usize,
     end: usize,
+    /// Tiles to go back through, and how many of them have their gradients kept at a time.
+    tiles: usize,
+    strip: usize,
+    /// Tiles whose gradients are kept and not yet summed, before the first of this chunk and by now.
+    first: usize,
+    waiting: usize,
+    /// Place of the gradients of the tile that went backward last.
+    latest: usize,
+    /// The parameters' gradients, in the order of the arithmetic.
+    sums: Vec<f32>,
     /// Floats of a tile's input and output.
     input: usize,
     output: usize,
@@ -274,24 +330,30 @@ impl Activations {
     /// Input rows of tile `n`, to be filled.
     #[inline(always)]
     pub fn input(&mut self, n: usize) -> &mut [f32] {
-        &mut self.values[n * self.stride..][..self.input]
+        &mut self.values[(self.first + n) * self.stride..][..self.input]
     }
 
     /// Output rows of tile `n`; in bf16 only until the next tile is evaluated.
     #[inline(always)]
     pub fn output(&self, n: usize) -> &[f32] {
-        &self.values[n * self.stride + self.end - self.output..][..self.output]
+        &self.values[(self.first + n) * self.stride + self.end - self.output..][..self.output]
     }
 
-    /// Gradient of the output rows of tile `n`, to be filled.
+    /// Gradient of the output rows of the tile that goes backward next, to be filled.
     #[inline(always)]
-    pub fn output_grad(&mut self, n: usize) -> &mut [f32] {
-        &mut self.grads[n * self.stride + self.end - self.output..][..self.output]
+    pub fn output_grad(&mut self) -> &mut [f32] {
+        &mut self.grads[self.waiting * self.stride + self.end - self.output..][..self.output]
     }
 
-    /// Gradient of the input rows of tile `n`; in bf16 only until the next tile goes backward.
+    /// Gradient of the input rows of the tile that went backward last.
     #[inline(always)]
-    pub fn input_grad(&self, n: usize) -> &[f32] {
-        &self.grads[n * self.stride..][..self.input]
+    pub fn input_grad(&self) -> &[f32] {
+        &self.grads[self.latest * self.stride..][..self.input]
+    }
+
+    /// Forgets gradients that nobody has asked for.
+    pub fn clear(&mut self) {
+        (self.first, self.waiting) = (0, 0);
+        self.sums.clear();
     }
 }

@@ -6,7 +6,7 @@
 use pulp::Simd;
 
 use super::{BLOCK, Layer};
-use crate::simd::TILE;
+use crate::simd::{TILE, row_sums};
 
 /// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
 pub struct Packed {
@@ -47,7 +47,8 @@ impl Packed {
             let (x, y) = tile[layer.row * TILE..].split_at_mut(layer.n_in * TILE);
             let w = &self.forward[layer.weight..][..layer.n_in * n_out];
             let bias = &self.bias[layer.bias..][..n_out];
-            matmul(simd, w, bias, x, &mut y[..n_out * TILE], n + 1 < layers.len());
+            let finish = if n + 1 < layers.len() { Finish::Relu } else { Finish::Plain };
+            matmul(simd, w, bias, x, &mut y[..n_out * TILE], finish);
         }
     }
 
@@ -57,12 +58,14 @@ impl Packed {
         for (n, layer) in layers.iter().enumerate().rev() {
             let (dx, dy) = grad[layer.row * TILE..].split_at_mut(layer.n_in * TILE);
             let w = &self.backward[layer.weight..][..layer.weights()];
-            matmul(simd, w, &[], &dy[..layer.n_out * TILE], dx, false);
-            if n > 0 {
-                let x = &tile[layer.row * TILE..][..layer.fresh() * TILE];
-                for (d, x) in dx.iter_mut().zip(x) {
-                    *d = if *x > 0.0 { *d } else { 0.0 };
-                }
+            let (fresh, again) = dx.split_at_mut(layer.fresh() * TILE);
+            let (w, w_again) = w.split_at(layer.fresh() * layer.n_out);
+            let dy = &dy[..layer.n_out * TILE];
+            let x = &tile[layer.row * TILE..][..layer.fresh() * TILE];
+            let finish = if n > 0 { Finish::Where(S::as_simd_f32s(x).0) } else { Finish::Plain };
+            matmul(simd, w, &[], dy, fresh, finish);
+            if layer.again > 0 {
+                matmul(simd, w_again, &[], dy, again, Finish::Plain);
             }
         }
         for layer in layers.iter().filter(|l| l.again > 0) {
@@ -75,7 +78,8 @@ impl Packed {
     }
 }
 
-/// Adds the parameter gradients of a chunk of `count` tiles to `out` (same order as the parameters).
+/// Adds the parameter gradients of `count` tiles to `sums`: layer by layer the weights' 4 × 4 blocks one after the other, then
+/// the biases.
 #[inline(always)]
 pub(super) fn accumulate<S: Simd>(
     simd: S,
@@ -83,24 +87,41 @@ pub(super) fn accumulate<S: Simd>(
     tiles: TileView,
     grads: TileView,
     count: usize,
-    out: &mut [f32],
+    sums: &mut [f32],
 ) {
     for layer in layers {
-        let (gw, gb) = out[layer.param..].split_at_mut(layer.weights());
+        let (weights, biases) = sums[layer.param..].split_at_mut(layer.weights());
+        let mut blocks = weights.as_chunks_mut::<{ BLOCK * BLOCK }>().0.iter_mut();
         let x = tiles.rows(layer.row);
         let dy = grads.rows(layer.row + layer.n_in);
         for o in (0..layer.n_out).step_by(BLOCK) {
-            bias_gradient(simd, dy.rows(o), count, &mut gb[o..o + BLOCK]);
+            bias_gradient(simd, dy.rows(o), count, &mut biases[o..o + BLOCK]);
             for i in (0..layer.n_in).step_by(BLOCK) {
-                let block = outer_product(simd, dy.rows(o), x.rows(i), count);
-                for (j, row) in block.iter().enumerate() {
-                    let at = (o + j) * layer.n_in + i;
-                    for (g, v) in gw[at..at + BLOCK].iter_mut().zip(row) {
-                        *g += v;
-                    }
+                let Some(block) = blocks.next() else { break };
+                let product = outer_product(simd, dy.rows(o), x.rows(i), count);
+                for (sum, p) in block.iter_mut().zip(product) {
+                    *sum += p;
                 }
             }
         }
+    }
+}
+
+/// Adds `sums` to `out`, in the order of the parameters.
+pub(super) fn unpack(layers: &[Layer], sums: &[f32], out: &mut [f32]) {
+    for layer in layers {
+        let (weights, biases) = sums[layer.param..].split_at(layer.weights());
+        let (gw, gb) = out[layer.param..].split_at_mut(layer.weights());
+        let mut blocks = weights.as_chunks::<{ BLOCK * BLOCK }>().0.iter();
+        for o in (0..layer.n_out).step_by(BLOCK) {
+            for (i, block) in (0..layer.n_in).step_by(BLOCK).zip(&mut blocks) {
+                for (j, row) in block.chunks_exact(BLOCK).enumerate() {
+                    let at = (o + j) * layer.n_in + i;
+                    gw[at..at + BLOCK].iter_mut().zip(row).for_each(|(g, v)| *g += v);
+                }
+            }
+        }
+        gb.iter_mut().zip(&biases[..layer.n_out]).for_each(|(g, v)| *g += v);
     }
 }
 
@@ -127,13 +148,25 @@ impl<'a> TileView<'a> {
     }
 }
 
-/// y = relu?(W x + b) for one tile; `w` is packed four outputs side by side.
+/// What becomes of a sum before it is written.
+#[derive(Clone, Copy)]
+enum Finish<'a, V> {
+    /// Nothing.
+    Plain,
+    /// Negative ones are 0.
+    Relu,
+    /// 0 except where these rows, of the same place as the output, are positive: the way back through a ReLU.
+    Where(&'a [V]),
+}
+
+/// y = W x + b for one tile, finished; `w` is packed four outputs side by side.
 #[inline(always)]
-fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], relu: bool) {
+fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], finish: Finish<S::f32s>) {
     let vectors = TILE / S::F32_LANES;
     let n_in = x.len() / TILE;
     let x = S::as_simd_f32s(x).0;
     let y = S::as_mut_simd_f32s(y).0;
+    let threes = x.as_chunks::<3>().0;
     let zero = simd.splat_f32s(0.0);
     for group in (0..vectors).step_by(3) {
         for (block, w) in w.chunks_exact(BLOCK * n_in).enumerate() {
@@ -143,8 +176,9 @@ fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], r
                     *a = [simd.splat_f32s(*b); 3];
                 }
             }
-            for (w, x) in w.chunks_exact(BLOCK).zip(x.chunks_exact(vectors)) {
-                let x = [x[group], x[group + 1], x[group + 2]];
+            let w = w.as_chunks::<BLOCK>().0;
+            for (k, w) in w.iter().enumerate() {
+                let x = &threes[(k * vectors + group) / 3];
                 for j in 0..BLOCK {
                     let w = simd.splat_f32s(w[j]);
                     for v in 0..3 {
@@ -153,9 +187,21 @@ fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], r
                 }
             }
             for (j, a) in acc.iter().enumerate() {
-                let out = &mut y[(block * BLOCK + j) * vectors + group..][..3];
-                for v in 0..3 {
-                    out[v] = if relu { simd.max_f32s(a[v], zero) } else { a[v] };
+                let at = (block * BLOCK + j) * vectors + group;
+                let Some(out) = y[at..].first_chunk_mut::<3>() else { continue };
+                match finish {
+                    Finish::Plain => *out = *a,
+                    Finish::Relu => {
+                        for v in 0..3 {
+                            out[v] = simd.max_f32s(a[v], zero);
+                        }
+                    }
+                    Finish::Where(x) => {
+                        let x = &x[at..][..3];
+                        for v in 0..3 {
+                            out[v] = simd.select_f32s(simd.greater_than_f32s(x[v], zero), a[v], zero);
+                        }
+                    }
                 }
             }
         }
@@ -164,7 +210,7 @@ fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], r
 
 /// Σ over samples of dy[j] x[k] for a 4 × 4 block.
 #[inline(always)]
-fn outer_product<S: Simd>(simd: S, dy: TileView, x: TileView, count: usize) -> [[f32; BLOCK]; BLOCK] {
+fn outer_product<S: Simd>(simd: S, dy: TileView, x: TileView, count: usize) -> [f32; BLOCK * BLOCK] {
     let vectors = TILE / S::F32_LANES;
     let mut acc = [[simd.splat_f32s(0.0); BLOCK]; BLOCK];
     for tile in 0..count {
@@ -180,11 +226,20 @@ fn outer_product<S: Simd>(simd: S, dy: TileView, x: TileView, count: usize) -> [
             }
         }
     }
+    if S::F32_LANES == BLOCK * BLOCK {
+        let mut rows = [[0.0; BLOCK * BLOCK]; BLOCK * BLOCK];
+        for j in 0..BLOCK {
+            for k in 0..BLOCK {
+                S::as_mut_simd_f32s(&mut rows[j * BLOCK + k]).0[0] = acc[j][k];
+            }
+        }
+        return row_sums(&rows);
+    }
     // Plain loops: a closure behind `map` may be compiled without the caller's vector features.
-    let mut sums = [[0.0; BLOCK]; BLOCK];
+    let mut sums = [0.0; BLOCK * BLOCK];
     for j in 0..BLOCK {
         for k in 0..BLOCK {
-            sums[j][k] = simd.reduce_sum_f32s(acc[j][k]);
+            sums[j * BLOCK + k] = simd.reduce_sum_f32s(acc[j][k]);
         }
     }
     sums

@@ -244,16 +244,18 @@ impl WithSimd for TrainTile<'_> {
         back.input(0).copy_from_slice(code.output(0));
         decoder.forward(simd, &unit, pack_decoder, &mut back, 0);
         let output = back.output(0).to_vec();
-        let grad = back.output_grad(0);
+        decoder.reserve_backward(1, &mut back);
+        encoder.reserve_backward(1, &mut code);
+        let grad = back.output_grad();
         grad.fill(0.0);
         loss_gradient(self.rows, &self.picked, full, &output, grad);
-        decoder.backward(simd, &unit, pack_decoder, &mut back, 0);
-        code.output_grad(0).copy_from_slice(back.input_grad(0));
-        encoder.backward(simd, &unit, pack_encoder, &mut code, 0);
         self.gradient.fill(0.0);
         let (of_encoder, of_decoder) = self.gradient.split_at_mut(encoder.parameters());
-        encoder.accumulate(simd, &unit, pack_encoder, &mut code, 1, of_encoder);
-        decoder.accumulate(simd, &unit, pack_decoder, &mut back, 1, of_decoder);
+        decoder.backward(simd, &unit, pack_decoder, &mut back, 0);
+        code.output_grad().copy_from_slice(back.input_grad());
+        encoder.backward(simd, &unit, pack_encoder, &mut code, 0);
+        decoder.finish(simd, pack_decoder, &mut back, of_decoder);
+        encoder.finish(simd, pack_encoder, &mut code, of_encoder);
     }
 }
 

@@ -393,8 +393,9 @@ impl Group {
             let Some((net, packed)) = model.net(s).filter(|_| !batch.is_empty()) else { continue };
             let StreamBatch { sample, levels, .. } = batch;
             let activations = &mut activations[s];
+            net.mlp.reserve_backward(sample.len().div_ceil(TILE), activations);
             for (n, (rays, shares)) in sample.chunks(TILE).zip(shares[s].chunks(TILE)).enumerate() {
-                let out = activations.output_grad(n);
+                let out = activations.output_grad();
                 out.fill(0.0);
                 for (lane, (ray, share)) in rays.iter().zip(shares).enumerate() {
                     let g = &rendered[*ray as usize * width..][..width];
@@ -403,13 +404,12 @@ impl Group {
                     }
                 }
                 net.mlp.backward(simd, &unit, packed, activations, n);
-                let input = activations.input_grad(n);
+                let input = activations.input_grad();
                 for (level, g) in levels.iter_mut().zip(input.chunks_exact(FEATURES * TILE)) {
                     level.write_tile(n, g);
                 }
             }
-            let tiles = sample.len().div_ceil(TILE);
-            net.mlp.accumulate(simd, &unit, packed, activations, tiles, &mut gradient[s]);
+            net.mlp.finish(simd, packed, activations, &mut gradient[s]);
         }
     }
 }

@@ -135,7 +135,7 @@ fn evaluate(heads: &Heads, s: usize, p: Vec3, time: f32, size: f32) -> Vec<f64> 
     let mut x: Vec<f64> = Vec::new();
     for (level, table) in net.grid.levels.iter().zip(&heads.tables[s]) {
         let mut rows = [Row::ZERO; 1];
-        level.encode(table, &points, &mut rows);
+        level.encode(table, &[points], &mut rows);
         x.extend(rows[0].to_array().map(f64::from));
     }
     if let Some([low, high]) = heads.shape.scales {
@@ -176,9 +176,7 @@ fn gradients(heads: &Heads, sources: &Sources, targets: &RayTargets) -> Gradient
         let levels = &heads.nets[s].as_ref().unwrap().grid.levels;
         let scattered = levels.iter().zip(&batch.levels).map(|(level, rows)| {
             let mut grads = vec![Row::ZERO; level.rows()];
-            for (pos, g) in batch.tiles().iter().zip(rows.rows[..batch.len()].chunks(TILE)) {
-                level.scatter(&mut grads, pos, g);
-            }
+            level.scatter(&mut grads, batch.tiles(), &rows.rows[..batch.len()]);
             grads
         });
         scattered.collect()

@@ -3,6 +3,10 @@
 
 #[cfg(target_arch = "x86_64")]
 pub mod amx;
+#[cfg(target_arch = "x86_64")]
+mod lanes;
+
+use super::lanes::Layout;
 
 /// Asks for the cache line `bytes` behind `value` before it is needed; on other processors than x86-64, their own
 /// prediction has to do.
@@ -17,4 +21,30 @@ pub fn prefetch<T>(value: &T, bytes: usize) {
     }
     #[cfg(not(target_arch = "x86_64"))]
     let _ = (value, bytes);
+}
+
+/// Sum of each row.
+#[inline(always)]
+pub fn row_sums(rows: &[[f32; 16]; 16]) -> [f32; 16] {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        // SAFETY: this processor has the instructions.
+        return unsafe { lanes::row_sums(rows) };
+    }
+    rows.map(|row| row.iter().sum())
+}
+
+/// As [`super::lanes::keep`], from number `first` of those kept on and without the zeros; false, and nothing is done, where there
+/// are no instructions for it.
+#[inline]
+pub fn keep_lanes(values: &mut [f32], layout: Layout, kept: &[u32], first: usize) -> bool {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        // SAFETY: this processor has the instructions.
+        unsafe { lanes::keep(values, layout, kept, first) };
+        return true;
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (values, layout, kept, first);
+    false
 }

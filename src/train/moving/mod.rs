@@ -16,6 +16,9 @@ use crate::stereo::StereoDepth;
 /// Cells of a volume along the longest side of the box; 1.6 cm in a room of 4 m.
 const CELLS: f32 = 256.0;
 
+/// Cells along each edge of a block.
+const BLOCK: u32 = 8;
+
 /// How far the surface of what moves is marked to both sides along the ray, cells.
 const THICKNESS: i32 = 1;
 
@@ -74,6 +77,8 @@ struct Opinion {
 #[derive(Clone, Default)]
 pub struct Volume {
     bits: Vec<u64>,
+    /// Whether any of the cells of a block is among them: few blocks are, and these bits stay in the nearest cache.
+    blocks: Vec<u64>,
     size: UVec3,
     cell: f32,
 }
@@ -84,7 +89,8 @@ impl Volume {
         let cell = extent.max_element() / CELLS;
         let size = (extent / cell).ceil().as_uvec3().max(UVec3::ONE);
         let cells = size.as_u64vec3().element_product() as usize;
-        Self { bits: vec![0; cells.div_ceil(64)], size, cell }
+        let blocks = (size / BLOCK + 1).element_product() as usize;
+        Self { bits: vec![0; cells.div_ceil(64)], blocks: vec![0; blocks.div_ceil(64)], size, cell }
     }
 
     /// What is clearly seen through, pixel by pixel.
@@ -124,13 +130,19 @@ impl Volume {
         for (word, bits) in self.bits.iter_mut().enumerate() {
             *bits = (0..64).filter(|n| agreed(64 * word + n)).fold(0, |bits, n| bits | 1 << n);
         }
+        for n in (0..self.size.element_product() as usize).filter(|n| is_set(&self.bits, *n)) {
+            let (row, [w, h]) = (n as u32 / self.size.x, [self.size.x, self.size.y]);
+            let block = self.block(UVec3::new(n as u32 % w, row % h, row / h));
+            self.blocks[block / 64] |= 1 << (block % 64);
+        }
         self
     }
 
     /// Whether a point (units) is in one of the cells.
     #[inline]
     pub fn contains(&self, p: Vec3) -> bool {
-        self.index(p).is_some_and(|n| self.bits[n / 64] >> (n % 64) & 1 == 1)
+        self.cell(p)
+            .is_some_and(|c| is_set(&self.blocks, self.block(c)) && is_set(&self.bits, self.number(c)))
     }
 
     /// Cells.
@@ -138,16 +150,39 @@ impl Volume {
         self.bits.iter().map(|b| b.count_ones() as usize).sum()
     }
 
+    /// Number of the cell that holds a point.
     #[inline]
     fn index(&self, p: Vec3) -> Option<usize> {
+        self.cell(p).map(|c| self.number(c))
+    }
+
+    /// The cell that holds a point.
+    #[inline]
+    fn cell(&self, p: Vec3) -> Option<UVec3> {
         if self.bits.is_empty() || !p.cmpge(Vec3::ZERO).all() {
             return None;
         }
         let c = (p * (1.0 / self.cell)).as_uvec3();
-        let at =
-            || ((c.z as usize * self.size.y as usize + c.y as usize) * self.size.x as usize) + c.x as usize;
-        c.cmplt(self.size).all().then(at)
+        c.cmplt(self.size).all().then_some(c)
     }
+
+    #[inline]
+    fn number(&self, c: UVec3) -> usize {
+        (c.z as usize * self.size.y as usize + c.y as usize) * self.size.x as usize + c.x as usize
+    }
+
+    /// Number of the block that a cell is in.
+    #[inline]
+    fn block(&self, c: UVec3) -> usize {
+        let (size, c) = (self.size / BLOCK + 1, c / BLOCK);
+        ((c.z * size.y + c.y) * size.x + c.x) as usize
+    }
+}
+
+/// Bit number `n`.
+#[inline]
+fn is_set(bits: &[u64], n: usize) -> bool {
+    bits[n / 64] >> (n % 64) & 1 == 1
 }
 
 #[cfg(test)]

@@ -11,7 +11,6 @@ use crate::field::mlp::Mlp;
 use crate::field::{EncodingKind, Stream};
 use crate::render::forward::Tracer;
 use crate::rng::Rng;
-use crate::simd::TILE;
 use crate::stereo::StereoDepth;
 use crate::train::loss::ChunkGradient;
 use crate::train::moving::{Evidence, Volume};
@@ -174,6 +173,7 @@ impl WithSimd for ChunkPass<'_> {
         }
         let loss = chunk.evaluate(simd, context, &mut tracer, &mut gradient, 0);
         chunk.backward(simd, context, &mut tracer, &gradient, dense);
+        group::finish(simd, context, &mut tracer, dense);
         loss.total
     }
 }
@@ -193,9 +193,7 @@ impl Traced {
                 .zip(&batch.levels)
                 .map(|(level, out)| {
                     let mut grad = vec![Row::ZERO; level.rows()];
-                    for (pos, g) in batch.tiles().iter().zip(out.rows[..batch.len()].chunks(TILE)) {
-                        level.scatter(&mut grad, pos, g);
-                    }
+                    level.scatter(&mut grad, batch.tiles(), &out.rows[..batch.len()]);
                     bytemuck::cast_slice(&grad).to_vec()
                 })
                 .collect();

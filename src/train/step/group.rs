@@ -4,7 +4,7 @@ use glam::{Vec2, Vec3};
 use pulp::Simd;
 
 use super::{CHUNK_RAYS, Companion, StepPlan};
-use crate::field::stream::StreamBatch;
+use crate::field::stream::{StreamActivations, StreamBatch};
 use crate::render::density_grid::DensityGrid;
 use crate::render::forward::{Chunk, Faint, Model, RayInput, Tracer};
 use crate::render::rays::View;
@@ -48,15 +48,20 @@ pub struct TrainChunk {
     pub traced: Chunk,
 }
 
-/// Chunks that one task works on, and its buffers, kept from step to step.
+/// Buffers of one thread, used for one chunk after the other: what is there stays in its core's cache.
+#[derive(Default)]
+pub struct Scratch {
+    tracer: Tracer,
+    gradient: ChunkGradient,
+}
+
+/// Chunks that one task works on, kept from step to step.
 #[derive(Default)]
 pub struct Group {
     pub chunks: Vec<TrainChunk>,
     /// Number of the first of them.
     first: usize,
     refresh: [Refresh; 3],
-    tracer: Tracer,
-    gradient: ChunkGradient,
     /// Gradient of the dense weights.
     pub dense: Vec<f32>,
     pub loss: ChunkLoss,
@@ -66,22 +71,25 @@ pub struct Group {
     pub evaluations: [usize; 3],
     /// Those of them that gave too little light to be learned from.
     pub faint: [usize; 3],
-    /// Steps through the density grids that its rays were spared.
+    /// Steps through the density grids that its rays have taken, and that they were spared.
+    pub taken: u64,
     pub spared: u64,
 }
 
 impl Group {
     /// Chooses the rays of `chunks` chunks, the first of which has the number `first`, and places their samples.
     #[inline(always)]
-    pub fn place(&mut self, context: &Context, first: usize, chunks: usize) {
+    pub fn place(&mut self, context: &Context, scratch: &mut Scratch, first: usize, chunks: usize) {
         self.chunks.resize_with(chunks, TrainChunk::default);
         self.first = first;
-        self.tracer.sampler.spared = 0;
+        scratch.tracer.sampler.taken = 0;
+        scratch.tracer.sampler.spared = 0;
         for (n, chunk) in self.chunks.iter_mut().enumerate() {
             chunk.choose_rays(context, first + n);
-            chunk.place(context, &mut self.tracer, first + n);
+            chunk.place(context, &mut scratch.tracer, first + n);
         }
-        self.spared = self.tracer.sampler.spared;
+        self.taken = scratch.tracer.sampler.taken;
+        self.spared = scratch.tracer.sampler.spared;
         let mut rng = Rng::new(context.seed, context.plan.step, u64::MAX - first as u64);
         for (s, refresh) in self.refresh.iter_mut().enumerate() {
             refresh.place(context, s, &mut rng);
@@ -96,10 +104,11 @@ impl Group {
 
     /// Evaluates the encoded samples and goes all the way back to their encodings.
     #[inline(always)]
-    pub fn evaluate<S: Simd>(&mut self, simd: S, context: &Context) {
-        let Self {
-            chunks, first, refresh, tracer, gradient, dense, loss, diverged, evaluations, faint, ..
-        } = self;
+    pub fn evaluate<S: Simd>(&mut self, simd: S, context: &Context, scratch: &mut Scratch) {
+        let Self { chunks, first, refresh, dense, loss, diverged, evaluations, faint, .. } = self;
+        let Scratch { tracer, gradient } = scratch;
+        // A panic may have left some.
+        tracer.activations.iter_mut().for_each(StreamActivations::clear);
         dense.clear();
         dense.resize(context.model.field.layout.len, 0.0);
         (*loss, *diverged, *evaluations, *faint) = (ChunkLoss::default(), None, [0; 3], [0; 3]);
@@ -114,6 +123,7 @@ impl Group {
             }
             chunk.backward(simd, context, tracer, gradient, dense);
         }
+        finish(simd, context, tracer, dense);
         for (s, refresh) in refresh.iter_mut().enumerate() {
             refresh.evaluate(simd, context, s, tracer);
         }
@@ -134,6 +144,18 @@ impl Group {
         for (cell, sigma) in cells.iter().zip(sigma) {
             grid.observe(*cell, *sigma, REFRESH_RATE);
         }
+    }
+}
+
+/// Adds the gradients of the networks' weights, of all chunks that have gone backward, to `dense`.
+#[inline(always)]
+pub fn finish<S: Simd>(simd: S, context: &Context, tracer: &mut Tracer, dense: &mut [f32]) {
+    let field = context.model.field;
+    for (s, r) in field.layout.streams.iter().enumerate() {
+        let (Some(net), Some(w)) = (&field.nets[s], context.model.weights(s)) else { continue };
+        // Trunk and head follow one another in the layout.
+        let (trunk, head) = dense[r.trunk.start..r.head.end].split_at_mut(r.trunk.len());
+        net.finish(simd, &w, &mut tracer.activations[s], [trunk, head]);
     }
 }
 
@@ -237,7 +259,8 @@ impl TrainChunk {
         loss::backward(context.config, &self.traced, &aims, count, scale, gradient)
     }
 
-    /// Adds the gradients of all dense weights to `dense`, and leaves those of the encodings in the batches.
+    /// Adds the gradients of all dense weights but those of the networks, which [`finish`] adds, to `dense`, and leaves those
+    /// of the encodings in the batches.
     #[inline(always)]
     pub fn backward<S: Simd>(
         &mut self,
@@ -260,8 +283,6 @@ impl TrainChunk {
             }
             let r = &field.layout.streams[s];
             let mut codes = vec![0.0; inputs.len() * net.code];
-            // Trunk and head follow one another in the layout.
-            let (trunk, head) = dense[r.trunk.start..r.head.end].split_at_mut(r.trunk.len());
             net.backward(
                 simd,
                 &w,
@@ -269,7 +290,6 @@ impl TrainChunk {
                 &mut tracer.activations[s],
                 &traced.samples[s],
                 &gradient.samples[s],
-                [trunk, head],
                 |ray, k, g| codes[ray * net.code + k] += g,
                 |ray, sample, g| {
                     let (origin, dir) = &mut rays[ray];

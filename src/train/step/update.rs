@@ -10,7 +10,7 @@ use crate::train::table_pass::TablePass;
 
 /// Updates everything that is learned, and the density grids.
 pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, plan: &StepPlan) {
-    let Optimiser { dense, tables, groups, gradient } = optimiser;
+    let Optimiser { dense, tables, groups, gradient, .. } = optimiser;
     let groups = &groups[..];
     let arch = pulp::Arch::new();
     let rate = StepSize::new(plan.table_rate, plan.step);
