@@ -4,6 +4,7 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::checkpoint::{Trained, TrainingState};
@@ -316,18 +317,24 @@ impl Trainer {
         let sampling = self.config.train.render_sampling();
         let pixels: usize = self.test.images.iter().map(Vec::len).sum();
         let stride = (pixels as f64 / TEST_PIXELS).sqrt().ceil() as u32;
-        let (mut squared, mut count) = (0.0, 0usize);
-        for (frame, truth) in self.test.frames.iter().zip(&self.test.images) {
-            let image = render(&model, frame, &sampling, stride);
-            for (n, rgb) in image.rgb.iter().enumerate() {
-                let (x, y) = (n as u32 % image.width * stride, n as u32 / image.width * stride);
-                let truth = truth[(y * frame.camera.width + x) as usize];
-                for c in 0..3 {
-                    squared += (f64::from(rgb[c]) - f64::from(truth[c]) / 255.0).powi(2);
+        // So few pixels of each that a frame is one piece of work.
+        let frames = self.test.frames.par_iter().zip(&self.test.images);
+        let sums: Vec<(f64, usize)> = frames
+            .map(|(frame, truth)| {
+                let image = render(&model, frame, &sampling, stride);
+                let mut squared = 0.0;
+                for (n, rgb) in image.rgb.iter().enumerate() {
+                    let (x, y) = (n as u32 % image.width * stride, n as u32 / image.width * stride);
+                    let truth = truth[(y * frame.camera.width + x) as usize];
+                    for c in 0..3 {
+                        squared += (f64::from(rgb[c]) - f64::from(truth[c]) / 255.0).powi(2);
+                    }
                 }
-                count += 3;
-            }
-        }
+                (squared, 3 * image.rgb.len())
+            })
+            .collect();
+        // In the frames' order, so that the sum does not depend on the threads.
+        let (squared, count) = sums.into_iter().fold((0.0, 0), |(a, n), (b, m)| (a + b, n + m));
         Some(psnr(squared / count as f64))
     }
 }
