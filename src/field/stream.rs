@@ -312,7 +312,7 @@ impl StreamNet {
     }
 
     /// Evaluates all samples of an encoded `batch`; `code` and `view` give the conditioning of a ray. `known`: what
-    /// [`Self::density_first`] said of them is used again.
+    /// [`Self::density`] said of them is used again.
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
     pub fn forward<'c, S: Simd>(
@@ -364,50 +364,35 @@ impl StreamNet {
         }
     }
 
-    /// Densities alone of all samples of an encoded `batch`, in lane order; colours and uncertainty are not computed.
+    /// Densities alone of all samples of an encoded `batch`, in lane order; colours and uncertainty are not computed. `first`:
+    /// some of the samples, by [`Self::retain`], will go through [`Self::forward`], for which what can be is kept.
     #[inline(always)]
+    #[allow(clippy::too_many_arguments)]
     pub fn density<'c, S: Simd>(
         &self,
         simd: S,
         w: &StreamWeights,
         batch: &StreamBatch,
         activations: &mut StreamActivations,
+        first: bool,
         code: impl Fn(usize) -> &'c [f32],
         out: &mut [f32],
     ) {
         let unit = Unit::detect();
         let trunk = &mut activations.trunk;
-        self.trunk.reserve(w.trunk, 1, trunk);
-        for (n, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
-            self.trunk_forward(simd, &unit, w, batch, n, trunk, 0, &code, 1);
-            self.read_densities(trunk.output(0), out);
+        let kept = first && w.trunk.keeps_tiles();
+        let (tiles, outputs) = if kept { (batch.pos.len(), self.trunk.output()) } else { (1, 1) };
+        self.trunk.reserve(w.trunk, tiles, trunk);
+        for (tile, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
+            let n = if kept { tile } else { 0 };
+            self.trunk_forward(simd, &unit, w, batch, tile, trunk, n, &code, outputs);
+            for (o, r) in out.iter_mut().zip(trunk.output(n)) {
+                *o = simd::exp((*r + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
+            }
         }
     }
 
-    /// As [`Self::density`], for a batch of which some samples, by [`Self::retain`], will go through [`Self::forward`].
-    #[inline(always)]
-    pub fn density_first<'c, S: Simd>(
-        &self,
-        simd: S,
-        w: &StreamWeights,
-        batch: &StreamBatch,
-        activations: &mut StreamActivations,
-        code: impl Fn(usize) -> &'c [f32],
-        out: &mut [f32],
-    ) {
-        if !w.trunk.keeps_tiles() {
-            return self.density(simd, w, batch, activations, code, out);
-        }
-        let unit = Unit::detect();
-        let trunk = &mut activations.trunk;
-        self.trunk.reserve(w.trunk, batch.pos.len(), trunk);
-        for (n, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
-            self.trunk_forward(simd, &unit, w, batch, n, trunk, n, &code, self.trunk.output());
-            self.read_densities(trunk.output(n), out);
-        }
-    }
-
-    /// Leaves the samples of `batch` of whose number in the chunk `keep` is true, with what [`Self::density_first`] has found
+    /// Leaves the samples of `batch` of whose number in the chunk `keep` is true, with what [`Self::density`] has found
     /// out about them.
     #[inline(always)]
     pub fn retain(
@@ -421,14 +406,6 @@ impl StreamNet {
         batch.retain(keep, !w.trunk.keeps_tiles());
         if w.trunk.keeps_tiles() {
             self.trunk.retain(&mut activations.trunk, &batch.kept);
-        }
-    }
-
-    /// Densities of one tile by the output rows of its trunk.
-    #[inline(always)]
-    fn read_densities(&self, raw: &[f32], out: &mut [f32]) {
-        for (o, r) in out.iter_mut().zip(raw) {
-            *o = simd::exp((*r + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
         }
     }
 
@@ -658,7 +635,7 @@ mod tests {
             let mut batch = encoded((0..COUNT).filter(|n| first || keep(*n)), false);
             if first {
                 let mut sigma = vec![0.0; COUNT];
-                net.density_first(simd, &w, &batch, &mut activations, code, &mut sigma);
+                net.density(simd, &w, &batch, &mut activations, true, code, &mut sigma);
                 net.retain(&w, &mut batch, &mut activations, keep);
             }
             net.forward(simd, &w, &batch, &mut activations, first, code, view, &mut out);

@@ -300,10 +300,7 @@ impl Chunk {
             let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
             sigma.resize(batches[s].len(), 0.0);
             let code = |r: usize| &codes[s][r * net.code..];
-            match colours {
-                true => net.density_first(simd, &w, &batches[s], &mut activations[s], code, sigma),
-                false => net.density(simd, &w, &batches[s], &mut activations[s], code, sigma),
-            }
+            net.density(simd, &w, &batches[s], &mut activations[s], colours, code, sigma);
             for (&k, sigma) in batches[s].sample.iter().zip(&*sigma) {
                 intervals[k as usize].sigma[s] = *sigma;
             }

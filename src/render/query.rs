@@ -92,7 +92,7 @@ impl WithSimd for DensityPass<'_> {
         let code = |_: usize| &self.query.code[..];
         let mut activations = StreamActivations::default();
         self.query.net.encode(&self.weights, self.batch);
-        self.query.net.density(simd, &self.weights, self.batch, &mut activations, code, self.out);
+        self.query.net.density(simd, &self.weights, self.batch, &mut activations, false, code, self.out);
     }
 }
 

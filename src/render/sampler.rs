@@ -50,7 +50,6 @@ fn products(factors: [f32; STRIDE]) -> ([f32; STRIDE], f32) {
 /// Buffers of one thread.
 pub struct Sampler {
     weights: Vec<f32>,
-    sums: Vec<f32>,
     /// A ray is cut off where what stands leaves less than this of its light.
     saturated: f32,
     /// Steps through the grids that rays have taken, so far.
@@ -61,13 +60,7 @@ pub struct Sampler {
 
 impl Default for Sampler {
     fn default() -> Self {
-        Self {
-            weights: vec![0.0; MAX_STEPS],
-            sums: vec![0.0; MAX_STEPS],
-            saturated: SATURATED,
-            taken: 0,
-            spared: 0,
-        }
+        Self { weights: vec![0.0; MAX_STEPS], saturated: SATURATED, taken: 0, spared: 0 }
     }
 }
 
@@ -80,25 +73,6 @@ impl Sampler {
 }
 
 impl Sampler {
-    /// Sums of the weights of the first `used` steps, each with `floor` more, up to and with every step.
-    #[inline(always)]
-    fn add_up(&mut self, used: usize, floor: f32) {
-        let (weights, sums) = (self.weights.as_chunks::<STRIDE>().0, self.sums.as_chunks_mut::<STRIDE>().0);
-        let mut before = 0.0;
-        for (weights, sums) in weights.iter().zip(sums).take(used.div_ceil(STRIDE)) {
-            // Within the block first, so that blocks do not wait for one another.
-            let mut sum = 0.0;
-            for n in 0..STRIDE {
-                sum += weights[n] + floor;
-                sums[n] = sum;
-            }
-            for s in sums {
-                *s += before;
-            }
-            before += sum;
-        }
-    }
-
     /// Writes `count + 1` increasing distances to `edges`; false if the ray misses the box.
     ///
     /// `jitter` in [0, 1) shifts all edges by a part of one interval's weight.
@@ -171,21 +145,14 @@ impl Sampler {
         let floor = sampling.explore * total.max(0.05) / ((1.0 - sampling.explore) * span);
         let total = total + floor * span;
         let n = sampling.count;
-        self.add_up(used, floor);
-        let (sums, _) = self.sums.as_chunks::<STRIDE>();
-        let mut block = 0;
+        let (mut bin, mut below) = (0, 0.0);
         edges[0] = start;
         for (k, edge) in edges[1..n].iter_mut().enumerate() {
             let target = (k as f32 + 0.5 + jitter) / n as f32 * total;
-            while (block + 1) * STRIDE < used && sums[block][STRIDE - 1] < target {
-                block += 1;
+            while bin + 1 < used && below + self.weights[bin] + floor < target {
+                below += self.weights[bin] + floor;
+                bin += 1;
             }
-            let mut bin = block * STRIDE;
-            for sum in &sums[block] {
-                bin += usize::from(*sum < target);
-            }
-            let bin = bin.min(used - 1);
-            let below = if bin > 0 { self.sums[bin - 1] } else { 0.0 };
             let inside = ((target - below) / (self.weights[bin] + floor)).clamp(0.0, 1.0);
             *edge = start + (bin as f32 + inside) * dt;
         }

@@ -360,6 +360,6 @@ impl Refresh {
         let (Some(net), Some(w)) = (&context.model.field.nets[s], context.model.weights(s)) else { return };
         sigma.resize(batch.len(), 0.0);
         let code = |k: usize| &codes[k * net.code..];
-        net.density(simd, &w, batch, &mut tracer.activations[s], code, sigma);
+        net.density(simd, &w, batch, &mut tracer.activations[s], false, code, sigma);
     }
 }
