@@ -1,7 +1,8 @@
 //! A training step beside the least time that this machine allows for it.
 //!
 //! `cargo bench --bench step`. Trains `kitchen-a` from the data folder (`$DIVFF_DATA`, else `../shared/data`), or a scene of its
-//! own where that is absent, on a schedule of `DIVFF_STEPS` steps (1500), and looks at the last of them, where surfaces are sharp.
+//! own where that is absent, on the standard schedule or one of `DIVFF_STEPS` steps, and looks at some steps of each part of it:
+//! at first everything is evaluated, at the end only what is at surfaces.
 //!
 //! The floor counts what cannot be left out: the cells of density grids that rays pass, each network forward once where a stream
 //! has a density and backward where that is not faint, the rows of tables that are read and added to there, and moments that
@@ -19,14 +20,17 @@ use divff::field::mlp::{Mlp, Precision};
 use divff::scene::Scene;
 use divff::simd::matrix;
 use divff::synth::{self, SynthOptions};
-use divff::train::Trainer;
 use divff::train::step::StepReport;
+use divff::train::{TrainError, Trainer};
 
 mod machine;
 use machine::Machine;
 
-/// Steps that are looked at.
-const STEPS: usize = 100;
+/// Parts of the schedule, in the middle of each of which steps are looked at.
+const PARTS: usize = 8;
+
+/// Steps that are looked at together.
+const STEPS: usize = 20;
 
 /// What a step has to do at least.
 #[derive(Clone, Copy, Default)]
@@ -52,15 +56,14 @@ impl Work {
             // Backward, the gradients of inputs and of weights take as much as forward each.
             self.flops += 2.0 * (faint * density as f64 + 3.0 * kept * whole as f64);
             for level in &net.encoding.levels {
-                let Level::Lattice(lattice) = level else { continue };
-                let corners = if lattice.time_scale > 0.0 { 16.0 } else { 8.0 };
+                let corners = level.corners() as f64;
                 self.read_rows += corners * all;
                 self.added_rows += corners * kept;
             }
             if all > 0.0 {
-                // Values, gradients and two moments are read and written.
+                // Values and two moments are read and written; gradients need not leave a near cache.
                 let rows: usize = net.encoding.levels.iter().map(Level::rows).sum();
-                self.bytes += (8 * rows * size_of::<Row>()) as f64;
+                self.bytes += (6 * rows * size_of::<Row>()) as f64;
             }
         }
     }
@@ -79,32 +82,95 @@ fn density(trunk: &Mlp) -> usize {
     trunk.multiply_adds() - before * (outputs - 4)
 }
 
+/// Steps of one part of the schedule, or of all.
+#[derive(Clone, Copy, Default)]
+struct Looked {
+    steps: usize,
+    seconds: f64,
+    /// Placing, encoding, evaluating and updating.
+    phases: [f64; 4],
+    evaluations: usize,
+    work: Work,
+}
+
+impl Looked {
+    /// Takes [`STEPS`] steps at the share `fraction` of the schedule.
+    fn at(trainer: &mut Trainer, fraction: f64) -> Result<Self, TrainError> {
+        let mut looked = Self::default();
+        for _ in 0..STEPS {
+            let start = Instant::now();
+            let report = trainer.step(fraction, None)?;
+            looked.seconds += start.elapsed().as_secs_f64();
+            looked.work.add(&trainer.trained().field, &report);
+            looked.evaluations += report.evaluations.iter().sum::<usize>();
+            (0..4).for_each(|n| looked.phases[n] += report.seconds[n]);
+            looked.steps += 1;
+        }
+        Ok(looked)
+    }
+
+    fn add(&mut self, other: &Self) {
+        self.steps += other.steps;
+        self.seconds += other.seconds;
+        (0..4).for_each(|n| self.phases[n] += other.phases[n]);
+        self.evaluations += other.evaluations;
+        let (work, more) = (&mut self.work, &other.work);
+        work.flops += more.flops;
+        work.read_rows += more.read_rows;
+        work.cells += more.cells;
+        work.added_rows += more.added_rows;
+        work.bytes += more.bytes;
+    }
+
+    fn print(&self, name: &str, machine: &Machine, flops: f64) {
+        let mean = |seconds: f64| 1e3 * seconds / self.steps as f64;
+        let parts = self.work.seconds(machine, flops);
+        let (floor, phases) = (parts.iter().sum::<f64>(), self.phases.map(mean));
+        println!(
+            "{name:>5} {:>11} {:>9.1} {:>5.1} {:>8.1} {:>6.1} {:>9.1} {:>5.1} {:>8.1} {:>9.1} {:>11.1} {:>9.1} {:>7.0} %",
+            self.evaluations / self.steps,
+            mean(parts[0]),
+            mean(parts[1]),
+            mean(parts[2]),
+            mean(parts[3]),
+            mean(floor),
+            mean(self.seconds),
+            phases[0],
+            phases[1],
+            phases[2],
+            phases[3],
+            100.0 * floor / self.seconds
+        );
+    }
+}
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = tempfile::tempdir()?;
     let scene = Scene::open(&scene_folder(folder.path())?)?;
     let mut config = Config::default();
-    config.train.steps = std::env::var("DIVFF_STEPS").map_or(Ok(1500), |v| v.parse())?;
-    let before = config.train.steps.saturating_sub(STEPS as u64);
-    let mut trainer = Trainer::new(&scene, &config)?;
-    eprintln!("training {before} of {} steps", config.train.steps);
-    trainer.run(folder.path(), None, &mut |p| {
-        if p.step >= before { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    })?;
-    let fraction = before as f64 / config.train.steps as f64;
-    let (mut times, mut work, mut evaluations) = (Vec::new(), Work::default(), 0);
-    let mut phases = [0.0; 4];
-    for _ in 0..STEPS {
-        let start = Instant::now();
-        let report = trainer.step(fraction, None)?;
-        times.push(1e3 * start.elapsed().as_secs_f64());
-        work.add(&trainer.trained().field, &report);
-        evaluations += report.evaluations.iter().sum::<usize>();
-        (0..4).for_each(|n| phases[n] += 1e3 * report.seconds[n] / STEPS as f64);
+    if let Ok(steps) = std::env::var("DIVFF_STEPS") {
+        config.train.steps = steps.parse()?;
     }
-    times.sort_by(f64::total_cmp);
+    let steps = config.train.steps;
+    let mut trainer = Trainer::new(&scene, &config)?;
+    let (mut parts, mut all) = (Vec::new(), Looked::default());
+    for part in 0..PARTS {
+        let fraction = (part as f64 + 0.5) / PARTS as f64;
+        let before = (fraction * steps as f64) as u64;
+        eprintln!("training {before} of {steps} steps");
+        trainer.run(folder.path(), None, &mut |p| {
+            if p.step >= before { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        })?;
+        let looked = Looked::at(&mut trainer, fraction)?;
+        all.add(&looked);
+        parts.push((fraction, looked));
+    }
 
     let threads = rayon::current_num_threads();
-    let machine = Machine::measure(threads);
+    let bytes = |looked: &Looked| looked.work.bytes / looked.steps as f64;
+    // Read and written, in bytes.
+    let state = parts.iter().map(|(_, looked)| bytes(looked) / 2.0).fold(0.0, f64::max);
+    let machine = Machine::measure(threads, state as usize);
     let bf16 = match config.train.precision {
         Precision::Auto => matrix::available(),
         precision => precision == Precision::Bf16,
@@ -118,32 +184,22 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         machine.added_rows / 1e6,
         machine.bytes / 1e9
     );
-    let mean = |total: f64| total / STEPS as f64;
+    let mean = |total: f64| total / all.steps as f64;
     println!(
-        "a step: {} evaluations, {:.2} GFLOP, {:.1} M rows read and {:.1} M added to, {:.0} MB of moments, \
-         {:.1} M cells passed",
-        evaluations / STEPS,
-        mean(work.flops) / 1e9,
-        mean(work.read_rows) / 1e6,
-        mean(work.added_rows) / 1e6,
-        mean(work.bytes) / 1e6,
-        mean(work.cells) / 1e6
-    );
-    let parts = work.seconds(&machine, flops).map(|s| 1e3 * mean(s));
-    let (floor, median) = (parts.iter().sum::<f64>(), times[STEPS / 2]);
-    println!(
-        "floor {floor:.1} ms: networks {:.1}, rows {:.1}, moments {:.1}, cells {:.1}",
-        parts[0], parts[1], parts[2], parts[3]
+        "a step: {:.2} GFLOP, {:.1} M rows read and {:.1} M added to, {:.0} MB of moments, {:.1} M cells passed",
+        mean(all.work.flops) / 1e9,
+        mean(all.work.read_rows) / 1e6,
+        mean(all.work.added_rows) / 1e6,
+        mean(all.work.bytes) / 1e6,
+        mean(all.work.cells) / 1e6
     );
     println!(
-        "time {median:.1} ms (least {:.1}): the floor is {:.0} % of it",
-        times[0],
-        100.0 * floor / median
+        "   at evaluations  networks  rows  moments  cells  floor/ms  time  placing  encoding  evaluating  updating    floor"
     );
-    println!(
-        "of it, on average: placing {:.1}, encoding {:.1}, evaluating both ways {:.1}, updating {:.1}",
-        phases[0], phases[1], phases[2], phases[3]
-    );
+    for (fraction, looked) in &parts {
+        looked.print(&format!("{:.0} %", 100.0 * fraction), &machine, flops);
+    }
+    all.print("all", &machine, flops);
     Ok(())
 }
 

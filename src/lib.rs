@@ -24,5 +24,6 @@ pub mod semantics;
 pub mod simd;
 pub mod stereo;
 pub mod synth;
+mod tasks;
 pub mod train;
 pub mod work;

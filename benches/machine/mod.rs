@@ -15,9 +15,6 @@ const ROUNDS: usize = 5;
 /// Rows of a table of 2 MiB, as a level has.
 const ROWS: usize = 1 << 17;
 
-/// Floats that no cache holds.
-const FLOATS: usize = 1 << 26;
-
 /// Rates of some threads together.
 pub struct Machine {
     /// Floating-point operations a second in f32, a fused multiply-add being two.
@@ -28,13 +25,14 @@ pub struct Machine {
     pub rows: f64,
     /// Rows added to a second there: read, and written back.
     pub added_rows: f64,
-    /// Bytes a second read from memory and written back.
+    /// Bytes a second read from wherever they are kept and written back.
     pub bytes: f64,
 }
 
 impl Machine {
-    /// Measures `threads` threads.
-    pub fn measure(threads: usize) -> Self {
+    /// Measures `threads` threads, of which `state` bytes are read and written in turn: on many machines a cache holds those of
+    /// all tables.
+    pub fn measure(threads: usize, state: usize) -> Self {
         let pool =
             rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads can be started");
         let bf16 = std::env::var("DIVFF_BF16_GFLOPS").ok().and_then(|v| v.parse().ok()).unwrap_or(2600.0);
@@ -45,7 +43,7 @@ impl Machine {
             added_rows: best(|| {
                 together(threads, || pulp::Arch::new().dispatch(Adds(&mut vec![Row::ONE; ROWS])))
             }),
-            bytes: bytes(threads),
+            bytes: bytes(threads, state),
         })
     }
 }
@@ -61,17 +59,32 @@ fn together(threads: usize, work: impl Fn() -> f64 + Sync) -> f64 {
     done / start.elapsed().as_secs_f64()
 }
 
-fn bytes(threads: usize) -> f64 {
-    let mut floats = vec![1f32; FLOATS];
-    let chunk = FLOATS / threads.max(1);
+fn bytes(threads: usize, state: usize) -> f64 {
+    let mut floats = vec![1f32; (state / size_of::<f32>()).max(threads)];
+    let chunk = floats.len().div_ceil(threads);
     let mut round = || {
         let start = Instant::now();
-        floats.par_chunks_mut(chunk).for_each(|c| c.iter_mut().for_each(|v| *v *= 0.999));
-        2.0 * size_of::<f32>() as f64 * FLOATS as f64 / start.elapsed().as_secs_f64()
+        floats.par_chunks_mut(chunk).for_each(|c| pulp::Arch::new().dispatch(Rewrites(c)));
+        // Read, and written.
+        2.0 * state as f64 / start.elapsed().as_secs_f64()
     };
     let fastest = (0..ROUNDS).map(|_| round()).fold(0.0, f64::max);
     black_box(&floats);
     fastest
+}
+
+/// Numbers that are read and written back.
+struct Rewrites<'a>(&'a mut [f32]);
+
+impl WithSimd for Rewrites<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        for v in self.0 {
+            *v *= 0.999;
+        }
+    }
 }
 
 /// As many sums as hide the latency of a fused multiply-add.

@@ -5,7 +5,7 @@
 
 use std::f32::consts::PI;
 
-use super::hashgrid::{FEATURES, HashGrid, Lattice, Points, Row};
+use super::hashgrid::{Around, FEATURES, HashGrid, Lattice, Points, Row};
 use crate::simd::{TILE, sin_cos_pi};
 
 /// One row of features of a position.
@@ -64,11 +64,20 @@ impl Level {
         }
     }
 
+    /// Rows of its table between which a point is interpolated.
+    pub fn corners(&self) -> usize {
+        match self {
+            Self::Lattice(lattice) if lattice.has_time() => 16,
+            Self::Lattice(_) => 8,
+            Self::Position | Self::Waves { .. } => 0,
+        }
+    }
+
     /// Writes the features of `tiles` of points to `out`, a row a point; those that the last tile has too many are left out.
     #[inline(always)]
-    pub fn encode(&self, table: &[Row], tiles: &[Points], out: &mut [Row]) {
+    pub fn encode(&self, table: &[Row], tiles: &[Points], out: &mut [Row], around: &mut Around) {
         if let Self::Lattice(lattice) = self {
-            return lattice.encode(table, tiles, out);
+            return lattice.encode(table, tiles, out, around);
         }
         for (pos, out) in tiles.iter().zip(out.chunks_mut(TILE)) {
             if let Self::Waves { axis, half_turns } = *self {
@@ -89,11 +98,12 @@ impl Level {
         tiles: &[Points],
         out: &mut [Row],
         slopes: &mut [[Row; 3]],
+        around: &mut Around,
     ) {
         if let Self::Lattice(lattice) = self {
-            return lattice.encode_with_slopes(table, tiles, out, slopes);
+            return lattice.encode_with_slopes(table, tiles, out, slopes, around);
         }
-        self.encode(table, tiles, out);
+        self.encode(table, tiles, out, around);
         for (row, slopes) in out.iter().zip(slopes) {
             *slopes = match *self {
                 Self::Waves { axis, half_turns } => {
@@ -108,9 +118,9 @@ impl Level {
 
     /// Adds the gradients `g` of the features of `tiles` to the rows that they were read from; nothing where none were.
     #[inline(always)]
-    pub fn scatter(&self, grads: &mut [Row], tiles: &[Points], g: &[Row]) {
+    pub fn scatter(&self, grads: &mut [Row], tiles: &[Points], g: &[Row], around: &mut Around) {
         if let Self::Lattice(lattice) = self {
-            lattice.scatter(grads, tiles, g);
+            lattice.scatter(grads, tiles, g, around);
         }
     }
 }
@@ -173,7 +183,7 @@ mod tests {
             let pos = tile(seed);
             for (n, level) in encoding.levels.iter().enumerate() {
                 let mut rows = [Row::ZERO; TILE];
-                level.encode(&[], &[pos], &mut rows);
+                level.encode(&[], &[pos], &mut rows, &mut Around::default());
                 for (lane, row) in rows.iter().enumerate() {
                     let truth = &defined(at(&pos, lane))[n * FEATURES..];
                     for (a, b) in row.to_array().iter().zip(truth) {
@@ -191,9 +201,9 @@ mod tests {
         let pos = tile(100);
         for (n, level) in encoding.levels.iter().enumerate() {
             let (mut rows, mut slopes) = ([Row::ZERO; TILE], [[Row::ZERO; 3]; TILE]);
-            level.encode_with_slopes(&[], &[pos], &mut rows, &mut slopes);
+            level.encode_with_slopes(&[], &[pos], &mut rows, &mut slopes, &mut Around::default());
             let mut plain = [Row::ZERO; TILE];
-            level.encode(&[], &[pos], &mut plain);
+            level.encode(&[], &[pos], &mut plain, &mut Around::default());
             assert_eq!(rows, plain);
             for (lane, slopes) in slopes.iter().enumerate() {
                 for (axis, slope) in slopes.iter().enumerate() {
@@ -219,7 +229,7 @@ mod tests {
         for x in [1e3, -1e3, 1e9, f32::MAX, f32::MIN, f32::INFINITY, f32::NAN] {
             for level in &Encoding::frequency(BANDS).levels[1..] {
                 let mut rows = [Row::ZERO; TILE];
-                level.encode(&[], &[[[x; TILE]; AXES]], &mut rows);
+                level.encode(&[], &[[[x; TILE]; AXES]], &mut rows, &mut Around::default());
                 assert!(x.is_nan() || rows[0].abs().max_element() < 1.001, "{x}: {}", rows[0]);
             }
         }

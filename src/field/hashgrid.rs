@@ -45,6 +45,7 @@ pub struct Lattice {
 }
 
 /// The eight rows around each point of a tile and the points' places between them.
+#[derive(Clone)]
 struct Corners {
     /// `[corner][lane]`, x fastest.
     rows: [[u32; TILE]; 8],
@@ -52,16 +53,19 @@ struct Corners {
     frac: [[f32; TILE]; 3],
 }
 
-/// The corners around each point of a tile; for a lattice with time those before it and those after it.
-struct Around {
+/// The corners around each point of a tile; for a lattice with time those before it and those after it. A buffer.
+pub struct Around {
     before: Corners,
     after: Corners,
     /// Share of the latter.
     fraction: [f32; TILE],
 }
 
-impl Around {
-    const NONE: Self = Self { before: Corners::NONE, after: Corners::NONE, fraction: [0.0; TILE] };
+impl Default for Around {
+    fn default() -> Self {
+        let none = Corners { rows: [[0; TILE]; 8], frac: [[0.0; TILE]; 3] };
+        Self { before: none.clone(), after: none, fraction: [0.0; TILE] }
+    }
 }
 
 /// Shape of a grid over the box `[0, extent]`.
@@ -154,11 +158,10 @@ impl Lattice {
 
     /// Writes the features of `tiles` of points to `out`, a row a point; those that the last tile has too many are left out.
     #[inline(always)]
-    pub fn encode(&self, table: &[Row], tiles: &[Points], out: &mut [Row]) {
-        let mut around = Around::NONE;
+    pub fn encode(&self, table: &[Row], tiles: &[Points], out: &mut [Row], around: &mut Around) {
         for (pos, out) in tiles.iter().zip(out.chunks_mut(TILE)) {
-            self.find(pos, &mut around);
-            let Around { before, after, fraction } = &around;
+            self.find(pos, around);
+            let Around { before, after, fraction } = &*around;
             for (s, out) in out.iter_mut().enumerate() {
                 before.fetch(table, s + AHEAD);
                 *out = before.interpolate(table, s).0;
@@ -180,10 +183,10 @@ impl Lattice {
         tiles: &[Points],
         out: &mut [Row],
         slopes: &mut [[Row; 3]],
+        around: &mut Around,
     ) {
-        let mut around = Around::NONE;
         for (pos, (out, slopes)) in tiles.iter().zip(out.chunks_mut(TILE).zip(slopes.chunks_mut(TILE))) {
-            self.find(pos, &mut around);
+            self.find(pos, around);
             for (s, (out, slopes)) in out.iter_mut().zip(slopes).enumerate() {
                 let (mut value, mut by) = around.before.interpolate(table, s);
                 if self.has_time() {
@@ -199,7 +202,7 @@ impl Lattice {
     }
 
     /// Whether it spans time, too.
-    fn has_time(&self) -> bool {
+    pub fn has_time(&self) -> bool {
         self.time_scale != 0.0
     }
 
@@ -237,19 +240,24 @@ impl Lattice {
                 frac[axis][s] = (q - c).clamp(0.0, 1.0);
             }
         }
-        let (stride, mask) = (self.stride, self.rows as u32 - 1);
-        for (n, rows) in rows.iter_mut().enumerate() {
-            let [dx, dy, dz] = [n as u32 & 1, n as u32 >> 1 & 1, n as u32 >> 2];
-            for s in 0..TILE {
-                let x = cell[0][s] + dx;
-                let y = (cell[1][s] + dy).wrapping_mul(stride[1]);
-                let z = (cell[2][s] + dz).wrapping_mul(stride[2]);
-                let t = layer[s];
-                rows[s] = if self.dense {
-                    x.wrapping_add(y).wrapping_add(z).wrapping_add(t)
-                } else {
-                    (x ^ y ^ z ^ t) & mask
-                };
+        let mask = self.rows as u32 - 1;
+        let [_, stride_y, stride_z, _] = self.stride;
+        for s in 0..TILE {
+            let (x, y) = (cell[0][s], cell[1][s].wrapping_mul(stride_y));
+            let (z, t) = (cell[2][s].wrapping_mul(stride_z), layer[s]);
+            let (y, z) = ([y, y.wrapping_add(stride_y)], [z, z.wrapping_add(stride_z)]);
+            for dz in 0..2 {
+                for dy in 0..2 {
+                    let row = 4 * dz + 2 * dy;
+                    let [a, b] = if self.dense {
+                        let first = x.wrapping_add(y[dy]).wrapping_add(z[dz]).wrapping_add(t);
+                        [first, first.wrapping_add(1)]
+                    } else {
+                        let rest = y[dy] ^ z[dz] ^ t;
+                        [(x ^ rest) & mask, ((x + 1) ^ rest) & mask]
+                    };
+                    (rows[row][s], rows[row + 1][s]) = (a, b);
+                }
             }
         }
     }
@@ -257,11 +265,10 @@ impl Lattice {
     /// Adds the gradients `g` of the features of `tiles` to the rows around their points, by the weights with which they were
     /// read.
     #[inline(always)]
-    pub fn scatter(&self, grads: &mut [Row], tiles: &[Points], g: &[Row]) {
-        let mut around = Around::NONE;
+    pub fn scatter(&self, grads: &mut [Row], tiles: &[Points], g: &[Row], around: &mut Around) {
         for (pos, g) in tiles.iter().zip(g.chunks(TILE)) {
-            self.find(pos, &mut around);
-            let Around { before, after, fraction } = &around;
+            self.find(pos, around);
+            let Around { before, after, fraction } = &*around;
             if self.has_time() {
                 before.scatter(grads, g, |s| 1.0 - fraction[s]);
                 after.scatter(grads, g, |s| fraction[s]);
@@ -273,8 +280,6 @@ impl Lattice {
 }
 
 impl Corners {
-    const NONE: Self = Self { rows: [[0; TILE]; 8], frac: [[0.0; TILE]; 3] };
-
     /// Asks for the rows around the point of lane `s`, if there is one, before they are needed.
     #[inline(always)]
     fn fetch(&self, table: &[Row], s: usize) {

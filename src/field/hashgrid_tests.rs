@@ -3,7 +3,7 @@
 
 use glam::Vec3;
 
-use super::hashgrid::{AXES, HashGrid, Lattice, Points, Row, without_hashing};
+use super::hashgrid::{AXES, Around, HashGrid, Lattice, Points, Row, without_hashing};
 use crate::rng::Rng;
 use crate::simd::TILE;
 
@@ -39,7 +39,7 @@ fn tile(points: impl IntoIterator<Item = Vec3>) -> Tile {
 fn encode(grid: &HashGrid, tables: &[Vec<Row>], pos: &Tile) -> Vec<[Row; TILE]> {
     let encode = |(level, table): (&Lattice, &Vec<Row>)| {
         let mut out = [Row::ZERO; TILE];
-        level.encode(table, std::slice::from_ref(pos), &mut out);
+        level.encode(table, std::slice::from_ref(pos), &mut out, &mut Around::default());
         out
     };
     grid.levels.iter().zip(tables).map(encode).collect()
@@ -117,7 +117,7 @@ fn scatter_is_the_transpose_of_encode() {
     for (level, l) in grid.levels.iter().enumerate() {
         let g: Vec<Row> = (0..TILE).map(|_| Row::splat(2.0 * rng.uniform() - 1.0)).collect();
         let mut scattered = vec![Row::ZERO; l.rows];
-        l.scatter(&mut scattered, &[pos], &g);
+        l.scatter(&mut scattered, &[pos], &g, &mut Around::default());
         let dot = |a: Row, b: Row| f64::from(a.dot(b));
         let left: f64 = (0..TILE).map(|n| dot(encoded[level][n], g[n])).sum();
         let right: f64 = scattered.iter().zip(&tables[level]).map(|(a, b)| dot(*a, *b)).sum();
@@ -137,7 +137,13 @@ fn slopes_are_the_derivatives() {
     let points: Vec<Vec3> = random_points(5).into_iter().map(middle).collect();
     for (n, (level, table)) in grid.levels.iter().zip(&tables).enumerate() {
         let (mut rows, mut slopes) = ([Row::ZERO; TILE], [[Row::ZERO; 3]; TILE]);
-        level.encode_with_slopes(table, &[tile(points.clone())], &mut rows, &mut slopes);
+        level.encode_with_slopes(
+            table,
+            &[tile(points.clone())],
+            &mut rows,
+            &mut slopes,
+            &mut Around::default(),
+        );
         assert_eq!(rows, encode(&grid, &tables, &tile(points.clone()))[n]);
         for axis in 0..3 {
             let mut h = Vec3::ZERO;
@@ -168,10 +174,16 @@ fn points_outside_the_box_or_not_finite_are_harmless() {
         }
     }
     for level in &grid.levels {
-        level.scatter(&mut vec![Row::ZERO; level.rows], &[pos], &[Row::ONE; TILE]);
+        level.scatter(&mut vec![Row::ZERO; level.rows], &[pos], &[Row::ONE; TILE], &mut Around::default());
     }
     for (level, table) in grid.levels.iter().zip(&tables) {
-        level.encode_with_slopes(table, &[pos], &mut [Row::ZERO; TILE], &mut [[Row::ZERO; 3]; TILE]);
+        level.encode_with_slopes(
+            table,
+            &[pos],
+            &mut [Row::ZERO; TILE],
+            &mut [[Row::ZERO; 3]; TILE],
+            &mut Around::default(),
+        );
     }
     let clamped = encode(&grid, &tables, &tile([EXTENT, Vec3::ZERO]));
     let outside = encode(&grid, &tables, &tile([EXTENT * 3.0, -EXTENT]));

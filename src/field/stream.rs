@@ -10,7 +10,7 @@ use pulp::Simd;
 
 use super::config::Widths;
 use super::encoding::{Encoding, Level};
-use super::hashgrid::{AXES, FEATURES, Points, Row, TIME};
+use super::hashgrid::{AXES, Around, FEATURES, Points, Row, TIME};
 use super::mlp::{Activations, Mlp, Packed};
 use crate::simd::matrix::Unit;
 use crate::simd::{self, TILE};
@@ -65,10 +65,10 @@ pub struct StreamSamples {
 impl StreamSamples {
     /// Zeros for `n` samples.
     pub fn reset(&mut self, n: usize) {
-        self.sigma.clear();
-        self.rgb.clear();
-        self.beta.clear();
         self.resize(n);
+        self.sigma.fill(0.0);
+        self.rgb.as_flattened_mut().fill(0.0);
+        self.beta.fill(0.0);
     }
 
     /// Room for `n` samples; what is there already is left.
@@ -225,6 +225,15 @@ impl StreamBatch {
         self.sample.iter().enumerate().map(move |(n, s)| (*s as usize, at(n)))
     }
 
+    /// Encodes all samples.
+    #[inline(always)]
+    pub fn encode(&mut self, encoding: &Encoding, tables: &[Vec<Row>]) {
+        let mut around = Around::default();
+        for task in self.tasks(encoding, tables) {
+            task.run(&mut around);
+        }
+    }
+
     /// The encoding to be made of the samples, level by level: see [`LevelTask::run`].
     pub fn tasks<'a>(&'a mut self, encoding: &'a Encoding, tables: &'a [Vec<Row>]) -> Vec<LevelTask<'a>> {
         let Self { sample, pos, levels, slopes, .. } = self;
@@ -257,9 +266,14 @@ pub struct LevelTask<'a> {
 }
 
 impl LevelTask<'_> {
+    /// Rows that it looks up, or points where there are none.
+    pub fn cost(&self) -> usize {
+        self.lanes * self.level.corners().max(1)
+    }
+
     /// Looks up and interpolates.
     #[inline(always)]
-    pub fn run(self) {
+    pub fn run(self, around: &mut Around) {
         let Self { level, table, pos, lanes, slopes, out } = self;
         let wanted = pos.len() * TILE;
         // What an earlier, larger batch has left behind is of no one's concern.
@@ -270,9 +284,9 @@ impl LevelTask<'_> {
         let rows = &mut out.rows[..lanes];
         if slopes {
             out.slopes.resize(wanted, [Row::ZERO; 3]);
-            level.encode_with_slopes(table, pos, rows, &mut out.slopes);
+            level.encode_with_slopes(table, pos, rows, &mut out.slopes, around);
         } else {
-            level.encode(table, pos, rows);
+            level.encode(table, pos, rows, around);
         }
     }
 }
@@ -306,9 +320,7 @@ impl StreamNet {
     /// Encodes all samples of `batch`.
     #[inline(always)]
     pub fn encode(&self, w: &StreamWeights, batch: &mut StreamBatch) {
-        for task in batch.tasks(&self.encoding, w.tables) {
-            task.run();
-        }
+        batch.encode(&self.encoding, w.tables);
     }
 
     /// Evaluates all samples of an encoded `batch`; `code` and `view` give the conditioning of a ray. `known`: what
@@ -583,9 +595,7 @@ mod tests {
             batch.push(n, n / 5, p, rng.uniform());
         }
         let net = field.net(Stream::Dynamic).expect("all streams are on");
-        for task in batch.tasks(&net.encoding, &field.tables[Stream::Dynamic as usize]) {
-            task.run();
-        }
+        batch.encode(&net.encoding, &field.tables[Stream::Dynamic as usize]);
         batch
     }
 

@@ -49,11 +49,9 @@ pub fn update(weights: &mut [f32], grads: &[f32], first: &mut [f32], second: &mu
     }
 }
 
-/// State of one hash table during training.
+/// Moments of one hash table during training.
 #[derive(Clone, Debug)]
 pub struct TableState {
-    /// Gradient of this step; zero between steps.
-    pub grad: Vec<Row>,
     /// Running mean of the gradient.
     pub first: Vec<Row>,
     /// Running mean of its square.
@@ -64,16 +62,16 @@ impl TableState {
     /// Zeros for `rows` rows.
     pub fn new(rows: usize) -> Self {
         let zeros = vec![Row::ZERO; rows];
-        Self { grad: zeros.clone(), first: zeros.clone(), second: zeros }
+        Self { first: zeros.clone(), second: zeros }
     }
 
-    /// Updates what was touched in this step and clears the gradients.
+    /// Updates what has a gradient in this step and clears the gradients.
     ///
     /// Numbers without a gradient keep their moments: they were not seen, which is no evidence.
     #[inline(always)]
-    pub fn update(&mut self, table: &mut [Row], step: StepSize) {
-        let [w, g, m, v] = [table, &mut self.grad, &mut self.first, &mut self.second]
-            .map(bytemuck::cast_slice_mut::<Row, f32>);
+    pub fn update(&mut self, table: &mut [Row], gradient: &mut [Row], step: StepSize) {
+        let [w, g, m, v] =
+            [table, gradient, &mut self.first, &mut self.second].map(bytemuck::cast_slice_mut::<Row, f32>);
         for (((w, g), m), v) in w.iter_mut().zip(g).zip(m).zip(v) {
             let (m1, v1) = (*m + (1.0 - BETA1) * (*g - *m), *v + (1.0 - BETA2) * (*g * *g - *v));
             let w1 = *w - step.rate * m1 / ((v1 * step.correction).sqrt() + EPSILON);

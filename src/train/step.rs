@@ -6,7 +6,6 @@
 //! evaluate the networks, the loss and go backward; levels scatter and update. There are no atomics, and the result
 //! does not depend on the number of threads.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use pulp::{Simd, WithSimd};
@@ -17,13 +16,16 @@ use self::update::update;
 use super::adam::{Moments, TableState};
 use super::loss::LossConfig;
 use super::pixels::PixelSet;
+use super::table_pass::TableScratch;
 use crate::field::Field;
+use crate::field::hashgrid::Around;
 use crate::field::mlp::Precision;
 use crate::field::stream::LevelTask;
 use crate::render::forward::{Chunk, Grids, Model};
 use crate::render::rays::View;
 use crate::render::sampler::Sampling;
 use crate::rng::Rng;
+use crate::tasks::{PerThread, Tasks};
 
 #[cfg(test)]
 mod gradient_tests;
@@ -129,8 +131,8 @@ pub struct Optimiser {
     /// State of every table `[stream][level]`.
     pub tables: [Vec<TableState>; 3],
     groups: Vec<Group>,
-    /// One a thread.
-    scratch: Vec<Mutex<Scratch>>,
+    scratch: PerThread<Scratch>,
+    table_scratch: PerThread<TableScratch>,
     gradient: Vec<f32>,
 }
 
@@ -141,7 +143,8 @@ impl Optimiser {
             dense: Moments::new(field.layout.len),
             tables: field.tables.each_ref().map(|t| t.iter().map(|t| TableState::new(t.len())).collect()),
             groups: Vec::new(),
-            scratch: Vec::new(),
+            scratch: PerThread::default(),
+            table_scratch: PerThread::default(),
             gradient: vec![0.0; field.layout.len],
         }
     }
@@ -172,7 +175,6 @@ impl Optimiser {
         let chunks = chunks(plan.rays);
         let rays = chunks * CHUNK_RAYS;
         self.groups.resize_with(chunks.min(GROUPS), Group::default);
-        self.scratch.resize_with(rayon::current_num_threads(), Mutex::default);
         let scratch = &self.scratch;
         let chunks = chunks / self.groups.len().max(1);
         let mut views: Vec<View> = pixels.frames.iter().map(|f| View::new(field, f)).collect();
@@ -183,15 +185,18 @@ impl Optimiser {
         let model = Model::with_precision(field, grids, plan.streams, plan.precision);
         let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays, companion };
         let arch = pulp::Arch::new();
-        self.groups.par_iter_mut().enumerate().for_each(|(n, group)| {
+        self.groups.par_iter_mut().enumerate().with_max_len(1).for_each(|(n, group)| {
             arch.dispatch(PlacePass { context: &context, group, scratch, first_chunk: n * chunks, chunks });
         });
         let placed = Instant::now();
         encode(&mut self.groups, &model);
         let encoded = Instant::now();
-        self.groups.par_iter_mut().for_each(|group| {
-            arch.dispatch(EvaluatePass { context: &context, group, scratch });
-        });
+        let mut tasks = Tasks::default();
+        for group in &mut self.groups {
+            let pass = EvaluatePass { context: &context, group, scratch };
+            tasks.add(pass.group.samples(), move || arch.dispatch(pass));
+        }
+        tasks.run();
         drop(model);
         let evaluated = Instant::now();
         let mut report = StepReport { rays, ..StepReport::default() };
@@ -221,13 +226,6 @@ impl Optimiser {
     }
 }
 
-/// The buffers of the thread that asks, for which nobody else does.
-fn scratch_of(scratch: &[Mutex<Scratch>]) -> MutexGuard<'_, Scratch> {
-    let thread = rayon::current_thread_index().unwrap_or_default() % scratch.len();
-    // Whatever a panic has left there is written before it is read.
-    scratch[thread].lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 /// Encodes the samples of all groups, one level after the other.
 fn encode(groups: &mut [Group], model: &Model) {
     let mut levels: [Vec<Vec<LevelTask>>; 3] = Default::default();
@@ -239,17 +237,18 @@ fn encode(groups: &mut [Group], model: &Model) {
         }
     }
     let arch = pulp::Arch::new();
-    rayon::scope(|scope| {
-        for level in levels.into_iter().flatten() {
-            scope.spawn(move |_| arch.dispatch(EncodePass(level)));
-        }
-    });
+    let mut tasks = Tasks::default();
+    for level in levels.into_iter().flatten() {
+        let cost = level.iter().map(LevelTask::cost).sum();
+        tasks.add(cost, move || arch.dispatch(EncodePass(level)));
+    }
+    tasks.run();
 }
 
 struct PlacePass<'a> {
     context: &'a Context<'a>,
     group: &'a mut Group,
-    scratch: &'a [Mutex<Scratch>],
+    scratch: &'a PerThread<Scratch>,
     first_chunk: usize,
     chunks: usize,
 }
@@ -259,7 +258,7 @@ impl WithSimd for PlacePass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
-        self.group.place(self.context, &mut scratch_of(self.scratch), self.first_chunk, self.chunks);
+        self.group.place(self.context, &mut self.scratch.mine(), self.first_chunk, self.chunks);
     }
 }
 
@@ -270,8 +269,9 @@ impl WithSimd for EncodePass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
+        let mut around = Around::default();
         for task in self.0 {
-            task.run();
+            task.run(&mut around);
         }
     }
 }
@@ -279,7 +279,7 @@ impl WithSimd for EncodePass<'_> {
 struct EvaluatePass<'a> {
     context: &'a Context<'a>,
     group: &'a mut Group,
-    scratch: &'a [Mutex<Scratch>],
+    scratch: &'a PerThread<Scratch>,
 }
 
 impl WithSimd for EvaluatePass<'_> {
@@ -287,6 +287,6 @@ impl WithSimd for EvaluatePass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        self.group.evaluate(simd, self.context, &mut scratch_of(self.scratch));
+        self.group.evaluate(simd, self.context, &mut self.scratch.mine());
     }
 }

@@ -4,8 +4,17 @@ use pulp::{Simd, WithSimd};
 
 use super::adam::{StepSize, TableState};
 use crate::field::encoding::Level;
-use crate::field::hashgrid::Row;
+use crate::field::hashgrid::{Around, Row};
 use crate::field::stream::StreamBatch;
+use crate::tasks::PerThread;
+
+/// Buffers of one thread, used for one table after the other.
+#[derive(Default)]
+pub struct TableScratch {
+    /// Gradients of the rows of the table that the thread is at; zeros between tables.
+    gradient: Vec<Row>,
+    around: Around,
+}
 
 /// Scatters one level's gradients, batch after batch, and updates its table.
 pub struct TablePass<'a, B> {
@@ -17,10 +26,20 @@ pub struct TablePass<'a, B> {
     pub level: &'a Level,
     /// Its rows.
     pub table: &'a mut [Row],
-    /// Gradients and moments of the rows.
+    /// Moments of the rows.
     pub state: &'a mut TableState,
     /// How far a step goes.
     pub rate: StepSize,
+    /// Buffers of the thread.
+    pub scratch: &'a PerThread<TableScratch>,
+}
+
+impl<'a, B: Iterator<Item = &'a StreamBatch> + Clone> TablePass<'a, B> {
+    /// Rows that it adds to, and rows that it updates, which take about as long.
+    pub fn cost(&self) -> usize {
+        let points: usize = self.batches.clone().map(StreamBatch::len).sum();
+        points * self.level.corners() + self.table.len()
+    }
 }
 
 impl<'a, B: Iterator<Item = &'a StreamBatch>> WithSimd for TablePass<'_, B> {
@@ -28,10 +47,15 @@ impl<'a, B: Iterator<Item = &'a StreamBatch>> WithSimd for TablePass<'_, B> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
-        let Self { batches, number, level, table, state, rate } = self;
-        for batch in batches.filter(|b| !b.is_empty()) {
-            level.scatter(&mut state.grad, batch.tiles(), &batch.levels[number].rows[..batch.len()]);
+        let Self { batches, number, level, table, state, rate, scratch } = self;
+        let TableScratch { gradient, around } = &mut *scratch.mine();
+        if gradient.len() < table.len() {
+            gradient.resize(table.len(), Row::ZERO);
         }
-        state.update(table, rate);
+        let gradient = &mut gradient[..table.len()];
+        for batch in batches.filter(|b| !b.is_empty()) {
+            level.scatter(gradient, batch.tiles(), &batch.levels[number].rows[..batch.len()], around);
+        }
+        state.update(table, gradient, rate);
     }
 }

@@ -27,7 +27,7 @@ const LEAST_GRADIENT: f32 = 1e-18;
 
 /// Most tiles whose gradients are kept until those of the weights are summed: with what was evaluated there, they stay near
 /// the core, and a sum over fewer would not be worth its end.
-const STRIP: usize = 12;
+const STRIP: usize = 18;
 
 /// What the networks are multiplied in. Weights, sums, gradients and everything else are f32 in any case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -209,9 +209,7 @@ impl<'a> HeadModel<'a> {
     ) {
         let Some((net, packed)) = self.net(s) else { return };
         let unit = Unit::detect();
-        for task in batch.tasks(&net.grid, &self.heads.tables[s]) {
-            task.run();
-        }
+        batch.encode(&net.grid, &self.heads.tables[s]);
         let tiles = batch.len().div_ceil(TILE);
         net.mlp.reserve(packed, tiles, activations);
         for n in 0..tiles {

@@ -19,8 +19,9 @@ use crate::scene::features::Space;
 use crate::semantics::SemanticsError;
 use crate::simd::TILE;
 use crate::simd::matrix::Unit;
+use crate::tasks::{PerThread, Tasks};
 use crate::train::adam::{self, Moments, StepSize, TableState};
-use crate::train::table_pass::TablePass;
+use crate::train::table_pass::{TablePass, TableScratch};
 
 mod joint;
 
@@ -125,6 +126,7 @@ pub struct HeadOptimiser {
     moments: [Moments; 3],
     tables: [Vec<TableState>; 3],
     groups: Vec<Group>,
+    scratch: PerThread<TableScratch>,
 }
 
 /// Rays of one group and what they left.
@@ -154,6 +156,7 @@ impl HeadOptimiser {
             moments: heads.weights.each_ref().map(|w| Moments::new(w.len())),
             tables: heads.tables.each_ref().map(|t| t.iter().map(|t| TableState::new(t.len())).collect()),
             groups: (0..GROUPS).map(|_| Group::default()).collect(),
+            scratch: PerThread::default(),
         }
     }
 
@@ -172,7 +175,7 @@ impl HeadOptimiser {
         let count = (per_group * GROUPS) as f32;
         let model = HeadModel::new(heads, plan.precision);
         let arch = pulp::Arch::new();
-        self.groups.par_iter_mut().enumerate().for_each(|(n, group)| {
+        self.groups.par_iter_mut().enumerate().with_max_len(1).for_each(|(n, group)| {
             let mut rng = Rng::new(plan.seed, plan.step, n as u64);
             group.choose(&mut rng, targets, per_group, bags);
             arch.dispatch(GroupPass { group, model: &model, sources, targets, count });
@@ -201,21 +204,20 @@ impl HeadOptimiser {
     }
 
     fn update(&mut self, heads: &mut Heads, plan: &HeadStep) {
-        let Self { moments, tables, groups } = self;
-        let groups = &groups[..];
+        let Self { moments, tables, groups, scratch } = self;
+        let (groups, scratch) = (&groups[..], &*scratch);
         let (arch, rate) = (pulp::Arch::new(), StepSize::new(plan.table_rate, plan.step));
-        rayon::scope(|scope| {
-            for (s, (tables, states)) in heads.tables.iter_mut().zip(tables).enumerate() {
-                let Some(net) = &heads.nets[s] else { continue };
-                let levels = net.grid.levels.iter().enumerate();
-                // Finest levels first: they take longest.
-                for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)).rev() {
-                    let batches = groups.iter().map(move |g| &g.batches[s]);
-                    let pass = TablePass { batches, number, level, table, state, rate };
-                    scope.spawn(move |_| arch.dispatch(pass));
-                }
+        let mut tasks = Tasks::default();
+        for (s, (tables, states)) in heads.tables.iter_mut().zip(tables).enumerate() {
+            let Some(net) = &heads.nets[s] else { continue };
+            let levels = net.grid.levels.iter().enumerate();
+            for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)) {
+                let batches = groups.iter().map(move |g| &g.batches[s]);
+                let pass = TablePass { batches, number, level, table, state, rate, scratch };
+                tasks.add(pass.cost(), move || arch.dispatch(pass));
             }
-        });
+        }
+        tasks.run();
         let rate = StepSize::new(plan.network_rate, plan.step);
         for (s, (weights, moments)) in heads.weights.iter_mut().zip(moments).enumerate() {
             let mut gradient = vec![0.0; weights.len()];

@@ -7,7 +7,7 @@ use super::cache::Sources;
 use super::scale::Pyramid;
 use super::step::{Bags, Group, GroupPass, HeadOptimiser, HeadStep, RayTargets};
 use super::*;
-use crate::field::hashgrid::{AXES, Points, TIME};
+use crate::field::hashgrid::{AXES, Around, Points, TIME};
 use crate::semantics::config::SemanticsConfig;
 
 /// Three streams on small lattices, part features beside a descriptor of five numbers.
@@ -135,7 +135,7 @@ fn evaluate(heads: &Heads, s: usize, p: Vec3, time: f32, size: f32) -> Vec<f64> 
     let mut x: Vec<f64> = Vec::new();
     for (level, table) in net.grid.levels.iter().zip(&heads.tables[s]) {
         let mut rows = [Row::ZERO; 1];
-        level.encode(table, &[points], &mut rows);
+        level.encode(table, &[points], &mut rows, &mut Around::default());
         x.extend(rows[0].to_array().map(f64::from));
     }
     if let Some([low, high]) = heads.shape.scales {
@@ -176,7 +176,7 @@ fn gradients(heads: &Heads, sources: &Sources, targets: &RayTargets) -> Gradient
         let levels = &heads.nets[s].as_ref().unwrap().grid.levels;
         let scattered = levels.iter().zip(&batch.levels).map(|(level, rows)| {
             let mut grads = vec![Row::ZERO; level.rows()];
-            level.scatter(&mut grads, batch.tiles(), &rows.rows[..batch.len()]);
+            level.scatter(&mut grads, batch.tiles(), &rows.rows[..batch.len()], &mut Around::default());
             grads
         });
         scattered.collect()

@@ -6,7 +6,7 @@ use super::group::TrainChunk;
 use super::reference::{Numbers, Reference};
 use super::*;
 use crate::field::encoding::Level;
-use crate::field::hashgrid::{FEATURES, Row};
+use crate::field::hashgrid::{Around, FEATURES, Row};
 use crate::field::mlp::Mlp;
 use crate::field::{EncodingKind, Stream};
 use crate::render::forward::Tracer;
@@ -193,7 +193,7 @@ impl Traced {
                 .zip(&batch.levels)
                 .map(|(level, out)| {
                     let mut grad = vec![Row::ZERO; level.rows()];
-                    level.scatter(&mut grad, batch.tiles(), &out.rows[..batch.len()]);
+                    level.scatter(&mut grad, batch.tiles(), &out.rows[..batch.len()], &mut Around::default());
                     bytemuck::cast_slice(&grad).to_vec()
                 })
                 .collect();

@@ -102,6 +102,11 @@ impl Group {
         chunks.chain(self.refresh.iter_mut().map(|r| &mut r.batch).enumerate())
     }
 
+    /// Samples that are placed in all streams.
+    pub fn samples(&self) -> usize {
+        self.chunks.iter().flat_map(|chunk| &chunk.traced.batches).map(StreamBatch::len).sum()
+    }
+
     /// Evaluates the encoded samples and goes all the way back to their encodings.
     #[inline(always)]
     pub fn evaluate<S: Simd>(&mut self, simd: S, context: &Context, scratch: &mut Scratch) {

@@ -4,41 +4,44 @@ use std::ops::Range;
 
 use super::{Optimiser, StepPlan};
 use crate::field::Field;
+use crate::field::hashgrid::FEATURES;
 use crate::render::forward::Grids;
+use crate::tasks::Tasks;
 use crate::train::adam::{self, Moments, StepSize};
 use crate::train::table_pass::TablePass;
 
 /// Updates everything that is learned, and the density grids.
 pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, plan: &StepPlan) {
-    let Optimiser { dense, tables, groups, gradient, .. } = optimiser;
-    let groups = &groups[..];
+    let Optimiser { dense, tables, groups, gradient, table_scratch: scratch, .. } = optimiser;
+    let (groups, scratch) = (&groups[..], &*scratch);
     let arch = pulp::Arch::new();
     let rate = StepSize::new(plan.table_rate, plan.step);
-    rayon::scope(|scope| {
-        // Finest levels first: they take longest.
-        for (s, (tables, states)) in field.tables.iter_mut().zip(tables).enumerate() {
-            let (true, Some(net)) = (plan.streams[s], &field.nets[s]) else { continue };
-            let levels = net.encoding.levels.iter().enumerate();
-            for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)).rev() {
-                let chunks = groups.iter().flat_map(|g| &g.chunks);
-                let batches = chunks.map(move |chunk| &chunk.traced.batches[s]);
-                let pass = TablePass { batches, number, level, table, state, rate };
-                scope.spawn(move |_| arch.dispatch(pass));
-            }
+    let mut tasks = Tasks::default();
+    for (s, (tables, states)) in field.tables.iter_mut().zip(tables).enumerate() {
+        let (true, Some(net)) = (plan.streams[s], &field.nets[s]) else { continue };
+        let levels = net.encoding.levels.iter().enumerate();
+        for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)) {
+            let chunks = groups.iter().flat_map(|g| &g.chunks);
+            let batches = chunks.map(move |chunk| &chunk.traced.batches[s]);
+            let pass = TablePass { batches, number, level, table, state, rate, scratch };
+            tasks.add(pass.cost(), move || arch.dispatch(pass));
         }
-        for (s, grid) in grids.streams.iter_mut().enumerate().filter(|(s, _)| plan.streams[*s]) {
-            scope.spawn(move |_| {
-                groups.iter().for_each(|group| group.tell(s, grid, plan.grid_rate));
-                groups.iter().for_each(|group| group.tell_refreshed(s, grid));
-            });
-        }
-        gradient.fill(0.0);
+    }
+    for (s, grid) in grids.streams.iter_mut().enumerate().filter(|(s, _)| plan.streams[*s]) {
+        let cells = groups.iter().map(|group| group.evaluations[s]).sum();
+        tasks.add(cells, move || {
+            groups.iter().for_each(|group| group.tell(s, grid, plan.grid_rate));
+            groups.iter().for_each(|group| group.tell_refreshed(s, grid));
+        });
+    }
+    let sum = &mut gradient[..];
+    tasks.add(groups.len() * sum.len() / FEATURES, move || {
+        sum.fill(0.0);
         for group in groups {
-            for (g, d) in gradient.iter_mut().zip(&group.dense) {
-                *g += d;
-            }
+            sum.iter_mut().zip(&group.dense).for_each(|(g, d)| *g += d);
         }
     });
+    tasks.run();
     update_dense(field, dense, gradient, plan);
 }
 
