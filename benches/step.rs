@@ -6,7 +6,8 @@
 //!
 //! The floor counts what cannot be left out: the cells of density grids that rays pass, each network forward once where a stream
 //! has a density and backward where that is not faint, the rows of tables that are read and added to there, and moments that
-//! change. Choosing and cutting rays, compositing, loss and what the density grids are told are not in it.
+//! change; for random cells of the density grids, too, networks as far as their densities. Choosing and cutting rays, compositing
+//! and loss are not in it.
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -50,14 +51,14 @@ impl Work {
         for (s, net) in field.nets.iter().enumerate() {
             let Some(net) = net else { continue };
             let (all, faint) = (report.evaluations[s] as f64, report.faint[s] as f64);
-            let kept = all - faint;
+            let (kept, refreshed) = (all - faint, report.refreshed[s] as f64);
             let [whole, density] =
                 [net.trunk.multiply_adds() + net.head.multiply_adds(), density(&net.trunk)];
             // Backward, the gradients of inputs and of weights take as much as forward each.
-            self.flops += 2.0 * (faint * density as f64 + 3.0 * kept * whole as f64);
+            self.flops += 2.0 * ((faint + refreshed) * density as f64 + 3.0 * kept * whole as f64);
             for level in &net.encoding.levels {
                 let corners = level.corners() as f64;
-                self.read_rows += corners * all;
+                self.read_rows += corners * (all + refreshed);
                 self.added_rows += corners * kept;
             }
             if all > 0.0 {

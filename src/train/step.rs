@@ -106,7 +106,9 @@ pub struct StepReport {
     pub rays: usize,
     /// Field evaluations of each stream.
     pub evaluations: [usize; 3],
-    /// Of them those that gave too little light for their colour to be looked at and for anything to be learned from them.
+    /// Random cells of each stream's density grid whose density was looked at beside.
+    pub refreshed: [usize; 3],
+    /// Of the evaluations those that gave too little light for their colour to be looked at and for anything to be learned from them.
     pub faint: [usize; 3],
     /// Samples placed, times streams: what would have been evaluated without occupancy.
     pub candidates: usize,
@@ -206,6 +208,7 @@ impl Optimiser {
             for s in 0..3 {
                 report.evaluations[s] += g.evaluations[s];
                 report.faint[s] += g.faint[s];
+                report.refreshed[s] += g.refreshed(s);
             }
             report.taken += g.taken;
             report.spared += g.spared;

@@ -102,6 +102,11 @@ impl Group {
         chunks.chain(self.refresh.iter_mut().map(|r| &mut r.batch).enumerate())
     }
 
+    /// Random cells of the density grid of stream `s` that it looks at.
+    pub fn refreshed(&self, s: usize) -> usize {
+        self.refresh[s].cells.len()
+    }
+
     /// Samples that are placed in all streams.
     pub fn samples(&self) -> usize {
         self.chunks.iter().flat_map(|chunk| &chunk.traced.batches).map(StreamBatch::len).sum()
