@@ -64,7 +64,7 @@ impl Level {
         }
     }
 
-    /// Rows of its table between which a point is interpolated.
+    /// Rows of its table between which a point is interpolated; 0 where nothing is learned.
     pub fn corners(&self) -> usize {
         match self {
             Self::Lattice(lattice) if lattice.has_time() => 16,

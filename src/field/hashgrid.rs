@@ -53,7 +53,9 @@ struct Corners {
     frac: [[f32; TILE]; 3],
 }
 
-/// The corners around each point of a tile; for a lattice with time those before it and those after it. A buffer.
+/// The corners around each point of a tile; for a lattice with time those before it and those after it.
+///
+/// A buffer: what encodes or scatters overwrites it, tile after tile.
 pub struct Around {
     before: Corners,
     after: Corners,

@@ -187,6 +187,7 @@ impl Optimiser {
         let model = Model::with_precision(field, grids, plan.streams, plan.precision);
         let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays, companion };
         let arch = pulp::Arch::new();
+        // One by one: rayon would hand out several together, and a thread then waits for the other at the end.
         self.groups.par_iter_mut().enumerate().with_max_len(1).for_each(|(n, group)| {
             arch.dispatch(PlacePass { context: &context, group, scratch, first_chunk: n * chunks, chunks });
         });

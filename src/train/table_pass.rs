@@ -30,7 +30,7 @@ pub struct TablePass<'a, B> {
     pub state: &'a mut TableState,
     /// How far a step goes.
     pub rate: StepSize,
-    /// Buffers of the thread.
+    /// Buffers of the threads, of which the pass takes its own thread's.
     pub scratch: &'a PerThread<TableScratch>,
 }
 

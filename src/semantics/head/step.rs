@@ -175,6 +175,7 @@ impl HeadOptimiser {
         let count = (per_group * GROUPS) as f32;
         let model = HeadModel::new(heads, plan.precision);
         let arch = pulp::Arch::new();
+        // One by one, so that no thread waits for several of the other's at the end.
         self.groups.par_iter_mut().enumerate().with_max_len(1).for_each(|(n, group)| {
             let mut rng = Rng::new(plan.seed, plan.step, n as u64);
             group.choose(&mut rng, targets, per_group, bags);
