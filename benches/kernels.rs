@@ -8,11 +8,12 @@ use std::sync::LazyLock;
 use criterion::{Criterion, Throughput, criterion_main};
 use divff::field::hashgrid::{AXES, Around, HashGrid, Lattice, Points, Row};
 use divff::field::mlp::{Activations, Mlp, Packed, Precision};
-use divff::render::composite::{self, Interval, Weighted};
+use divff::render::composite::{self, Intervals, RayLayout, Weights};
 use divff::render::density_grid::{DensityGrid, STRIDE};
 use divff::render::rays::Ray;
-use divff::render::sampler::{Sampler, Sampling, Steer};
+use divff::render::sampler::{Lanes, RayLanes, Sampler, Sampling, Steer};
 use divff::simd::TILE;
+use divff::simd::floats::Floats;
 use divff::simd::matrix::Unit;
 use divff::train::adam::{StepSize, TableState};
 use glam::Vec3;
@@ -207,14 +208,14 @@ impl Steer for Wall {
     #[inline(always)]
     fn sigma(&self, points: &[[f32; STRIDE]; 3], _: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
         let mut out = [0.0; STRIDE];
-        self.0.add_at(points, 0, &mut out);
+        self.0.add_at(points, &[0; STRIDE], &mut out);
         [out, [0.0; STRIDE]]
     }
 }
 
 const SAMPLING: Sampling = Sampling { count: 20, step: 1.0 / 128.0, explore: 0.1, sharpness: 0.3 };
 
-struct SamplerPass<'a>(&'a mut Sampler, &'a Wall, &'a [Ray], &'a mut [f32]);
+struct SamplerPass<'a>(&'a mut Sampler, &'a Wall, &'a [Ray], &'a mut [Lanes]);
 
 impl WithSimd for SamplerPass<'_> {
     type Output = ();
@@ -222,24 +223,31 @@ impl WithSimd for SamplerPass<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
         let Self(sampler, wall, rays, edges) = self;
-        for ray in rays {
-            black_box(sampler.edges(ray, &SAMPLING, 0.5, wall, edges));
+        for together in rays.chunks(STRIDE) {
+            let mut rays = RayLanes::default();
+            together.iter().enumerate().for_each(|(n, ray)| rays.set(n, ray));
+            sampler.edges(&rays, &SAMPLING, &[0.5; STRIDE], wall, edges);
+            black_box(&edges);
         }
     }
 }
 
-struct CompositePass<'a>(&'a [Interval], &'a mut [Weighted], &'a mut [[f32; 3]]);
+struct CompositePass<'a> {
+    intervals: &'a Intervals,
+    weights: &'a mut Weights,
+}
 
 impl WithSimd for CompositePass<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let Self(intervals, weighted, d_sigma) = self;
-        let n = SAMPLING.count;
-        for ((i, w), d) in intervals.chunks(n).zip(weighted.chunks_mut(n)).zip(d_sigma.chunks_mut(n)) {
-            let left = composite::weights(i, w);
-            composite::backward(i, w, left, &[[0.1; 3]; SAMPLING.count], 0.1, d);
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { intervals, weights } = self;
+        weights.find(simd, intervals);
+        for rays in 0..intervals.layout.vectors::<S>() {
+            let mut gradient = [[Floats::new(simd, 0.1); 3]; SAMPLING.count];
+            composite::backward(simd, intervals, weights, rays, &mut gradient, Floats::new(simd, 0.1));
+            black_box(&gradient);
         }
     }
 }
@@ -256,7 +264,7 @@ fn rays(c: &mut Criterion) {
             Ray { origin, dir, dir_cam: Vec3::Z, refined_cam: Vec3::Z, range: (0.01, 0.99) }
         })
         .collect();
-    let mut edges = vec![0.0; SAMPLING.count + 1];
+    let mut edges = vec![[0.0; STRIDE]; SAMPLING.count + 1];
     let mut sampler = Sampler::default();
     let mut group = c.benchmark_group("rays");
     group.throughput(Throughput::Elements((rays.len() * SAMPLING.count) as u64));
@@ -265,14 +273,19 @@ fn rays(c: &mut Criterion) {
     group.bench_function("sampler", |b| {
         b.iter(|| pulp::Arch::new().dispatch(SamplerPass(&mut sampler, &wall, &rays, &mut edges)));
     });
-    let interval = |k: usize| Interval { sigma: [k as f32, 0.1, 0.2], delta: 0.02, t: 0.02 * k as f32 };
-    let intervals: Vec<Interval> = (0..32 * SAMPLING.count).map(|k| interval(k % SAMPLING.count)).collect();
-    let mut weighted = vec![Weighted::default(); intervals.len()];
-    let mut d_sigma = vec![[0.0; 3]; intervals.len()];
+    let (mut intervals, mut weights) = (Intervals::default(), Weights::default());
+    intervals.reset(RayLayout { rays: rays.len(), samples: SAMPLING.count });
+    let layout = intervals.layout;
+    for (n, k) in (0..rays.len()).flat_map(|ray| layout.of_ray(ray).zip(0u8..)) {
+        (0..3).for_each(|s| intervals.sigma[s][n] = [f32::from(k), 0.1, 0.2][s]);
+        (intervals.delta[n], intervals.t[n]) = (0.02, 0.02 * f32::from(k));
+    }
     // Two exponentials of some twenty operations, and as many again to mix three streams forward and backward.
-    floor("composite", 80.0 * intervals.len() as f64, MACHINE.flops);
+    floor("composite", 80.0 * layout.len() as f64, MACHINE.flops);
     group.bench_function("composite", |b| {
-        b.iter(|| pulp::Arch::new().dispatch(CompositePass(&intervals, &mut weighted, &mut d_sigma)));
+        b.iter(|| {
+            pulp::Arch::new().dispatch(CompositePass { intervals: &intervals, weights: &mut weights });
+        });
     });
 }
 

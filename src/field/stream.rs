@@ -13,7 +13,7 @@ use super::encoding::{Encoding, Level};
 use super::hashgrid::{AXES, Around, FEATURES, Points, Row, TIME};
 use super::mlp::{Activations, Mlp, Packed};
 use crate::simd::matrix::Unit;
-use crate::simd::{self, TILE};
+use crate::simd::{self, AlignedVec, TILE};
 
 /// Raw densities are clamped to this before the exponential, so that neither σ nor its gradient overflows.
 const RAW_SIGMA_LIMIT: f32 = 15.0;
@@ -51,31 +51,30 @@ pub struct StreamWeights<'a> {
     pub head: &'a Packed,
 }
 
-/// What a stream says about each of a chunk's samples, and on the way back the loss's gradient with respect to it.
+/// What a stream says about each of a chunk's samples, and on the way back the loss's gradient with respect to it; as columns.
 #[derive(Clone, Default)]
 pub struct StreamSamples {
     /// σ, 1/unit.
-    pub sigma: Vec<f32>,
+    pub sigma: AlignedVec,
     /// Colour, 0–1.
-    pub rgb: Vec<[f32; 3]>,
+    pub rgb: [AlignedVec; 3],
     /// Uncertainty β ≥ 0.
-    pub beta: Vec<f32>,
+    pub beta: AlignedVec,
 }
 
 impl StreamSamples {
+    fn columns(&mut self) -> impl Iterator<Item = &mut AlignedVec> {
+        self.rgb.iter_mut().chain([&mut self.sigma, &mut self.beta])
+    }
+
     /// Zeros for `n` samples.
     pub fn reset(&mut self, n: usize) {
-        self.resize(n);
-        self.sigma.fill(0.0);
-        self.rgb.as_flattened_mut().fill(0.0);
-        self.beta.fill(0.0);
+        self.columns().for_each(|column| column.zero(n));
     }
 
     /// Room for `n` samples; what is there already is left.
-    pub fn resize(&mut self, n: usize) {
-        self.sigma.resize(n, 0.0);
-        self.rgb.resize(n, [0.0; 3]);
-        self.beta.resize(n, 0.0);
+    pub fn reserve(&mut self, n: usize) {
+        self.columns().for_each(|column| column.reserve_len(n));
     }
 }
 
@@ -89,9 +88,9 @@ fn transposed([a, b, c, d]: [Row; FEATURES]) -> [Row; FEATURES] {
 /// What one level says about a batch's samples; after the way back, the gradient with respect to it.
 #[derive(Default)]
 pub struct LevelRows {
-    /// A row a lane, whole tiles.
+    /// A row a lane, whole tiles; behind them is what an earlier, larger batch has left.
     pub rows: Vec<Row>,
-    /// Derivatives by x, y and z, likewise, where the batch asks for them.
+    /// Derivatives by x, y and z of the lanes, likewise, where the batch asks for them.
     slopes: Vec<[Row; 3]>,
 }
 
@@ -137,13 +136,12 @@ pub struct StreamBatch {
     kept: Vec<u32>,
 }
 
-/// Leaves what stands at the places `kept`, in increasing order, of `values`.
+/// Moves what stands at the places `kept`, in increasing order, of `values` to their front.
 #[inline(always)]
-fn compact<T: Copy>(values: &mut Vec<T>, kept: &[u32]) {
+fn compact<T: Copy>(values: &mut [T], kept: &[u32]) {
     for (to, from) in kept.iter().enumerate() {
         values[to] = values[*from as usize];
     }
-    values.truncate(kept.len());
 }
 
 impl StreamBatch {
@@ -177,8 +175,10 @@ impl StreamBatch {
         kept.clear();
         kept.extend((0..sample.len() as u32).filter(|lane| keep(sample[*lane as usize] as usize)));
         let tiles = kept.len().div_ceil(TILE);
-        compact(sample, kept);
-        compact(ray, kept);
+        for numbers in [sample, ray] {
+            compact(numbers, kept);
+            numbers.truncate(kept.len());
+        }
         // No sample moves towards the end: its new place has been read before.
         for (to, from) in kept.iter().map(|n| *n as usize).enumerate() {
             for axis in 0..AXES {
@@ -189,11 +189,10 @@ impl StreamBatch {
         for level in levels {
             if encoded {
                 compact(&mut level.rows, kept);
+                level.rows[kept.len()..tiles * TILE].fill(Row::ZERO);
             }
-            level.rows.resize(tiles * TILE, Row::ZERO);
             if *slopes {
                 compact(&mut level.slopes, kept);
-                level.slopes.resize(tiles * TILE, [Row::ZERO; 3]);
             }
         }
     }
@@ -283,7 +282,9 @@ impl LevelTask<'_> {
         out.rows[lanes..wanted].fill(Row::ZERO);
         let rows = &mut out.rows[..lanes];
         if slopes {
-            out.slopes.resize(wanted, [Row::ZERO; 3]);
+            if out.slopes.len() < wanted {
+                out.slopes.resize(wanted, [Row::ZERO; 3]);
+            }
             level.encode_with_slopes(table, pos, rows, &mut out.slopes, around);
         } else {
             level.encode(table, pos, rows, around);
@@ -370,7 +371,9 @@ impl StreamNet {
             for (lane, &s) in lanes.iter().enumerate() {
                 let s = s as usize;
                 out.sigma[s] = raw[0][lane];
-                out.rgb[s] = [raw[1][lane], raw[2][lane], raw[3][lane]];
+                for c in 0..3 {
+                    out.rgb[c][s] = raw[1 + c][lane];
+                }
                 out.beta[s] = BETA_MAX * raw[4][lane];
             }
         }
@@ -474,8 +477,8 @@ impl StreamNet {
                 let s = s as usize;
                 raw[0][lane] = grad.sigma[s] * values.sigma[s];
                 for c in 0..3 {
-                    let v = values.rgb[s][c];
-                    raw[1 + c][lane] = grad.rgb[s][c] * v * (1.0 - v);
+                    let v = values.rgb[c][s];
+                    raw[1 + c][lane] = grad.rgb[c][s] * v * (1.0 - v);
                 }
                 raw[4][lane] = grad.beta[s] * values.beta[s] * (1.0 - values.beta[s] / BETA_MAX);
             }
@@ -612,7 +615,8 @@ mod tests {
                 assert_eq!(batch.pos.len(), alone.pos.len());
                 assert!(batch.points().eq(alone.points()));
                 for (a, b) in batch.levels.iter().zip(&alone.levels) {
-                    assert_eq!(a.rows, b.rows);
+                    let rows = batch.pos.len() * TILE;
+                    assert_eq!(a.rows[..rows], b.rows[..rows]);
                     let lanes = if slopes { batch.len() } else { 0 };
                     assert_eq!(a.slopes[..lanes], b.slopes[..lanes]);
                 }
@@ -666,7 +670,8 @@ mod tests {
             for keep in keeps {
                 let said = |first| {
                     let out = pulp::Arch::new().dispatch(Said { field: &field, precision, keep, first });
-                    (out.sigma, out.rgb, out.beta)
+                    let StreamSamples { sigma, rgb: [r, g, b], beta } = out;
+                    [sigma, r, g, b, beta].map(|column| column.to_vec())
                 };
                 assert_eq!(said(true), said(false));
             }

@@ -1,12 +1,50 @@
 //! Compositing on known answers and at the ends of f32.
 
-use super::composite::{Interval, Weighted, backward, weights};
-use crate::rng::Rng;
+use pulp::{Simd, WithSimd};
 
-fn composited(intervals: &[Interval]) -> (Vec<Weighted>, f32) {
-    let mut out = vec![Weighted::default(); intervals.len()];
-    let left = weights(intervals, &mut out);
-    (out, left)
+use super::composite::{Interval, Intervals, Weights, backward};
+use crate::rng::Rng;
+use crate::simd::floats::{ColumnMut, Floats};
+
+/// Composites one ray, in the first lane, and goes back from the gradient `g` with respect to its weights and `d_left` with
+/// respect to the light that is left.
+struct OneRay<'a> {
+    intervals: &'a [Interval],
+    g: &'a [[f32; 3]],
+    d_left: f32,
+}
+
+/// Weights, light that is left, and the gradient with respect to σ.
+type Passed = (Vec<[f32; 3]>, f32, Vec<[f32; 3]>);
+
+impl WithSimd for OneRay<'_> {
+    type Output = Passed;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Passed {
+        let Self { intervals, g, d_left } = self;
+        let columns = Intervals::of_ray(intervals);
+        let mut weights = Weights::default();
+        weights.find(simd, &columns);
+        let mut gradient: Vec<_> = g.iter().map(|g| g.map(|g| Floats::new(simd, g))).collect();
+        backward(simd, &columns, &weights, 0, &mut gradient, Floats::new(simd, d_left));
+        let first = |values: Floats<S>| {
+            let mut lanes = [0.0; 16];
+            ColumnMut::new(simd, &mut lanes).set(0, values);
+            lanes[0]
+        };
+        let gradient = gradient.into_iter().map(|g| g.map(first)).collect();
+        (columns.layout.of_ray(0).map(|n| weights.at(n)).collect(), weights.left[0], gradient)
+    }
+}
+
+fn composited(intervals: &[Interval]) -> (Vec<[f32; 3]>, f32) {
+    let (weights, left, _) = pulp::Arch::new().dispatch(OneRay { intervals, g: &[], d_left: 0.0 });
+    (weights, left)
+}
+
+fn gradient_of(intervals: &[Interval], g: &[[f32; 3]], d_left: f32) -> Vec<[f32; 3]> {
+    pulp::Arch::new().dispatch(OneRay { intervals, g, d_left }).2
 }
 
 #[test]
@@ -22,7 +60,7 @@ fn weights_plus_transmittance_is_one() {
                 })
                 .collect();
             let (out, left) = composited(&intervals);
-            let sum: f64 = out.iter().flat_map(|w| w.weight).map(f64::from).sum::<f64>() + f64::from(left);
+            let sum: f64 = out.as_flattened().iter().copied().map(f64::from).sum::<f64>() + f64::from(left);
             // Half an ulp for each addition to the optical depth, and a few ulp of the exponential.
             let allowed = (n + 8) as f64 * 2f64.powi(-23);
             assert!((sum - 1.0).abs() < allowed, "{n} intervals: 1 became {sum}");
@@ -40,7 +78,7 @@ fn a_homogeneous_medium_has_the_opacity_of_beer_and_lambert() {
         let intervals: Vec<Interval> =
             lengths.iter().map(|&delta| Interval { sigma: share, delta, t: 0.0 }).collect();
         let (out, left) = composited(&intervals);
-        let opacity: f64 = out.iter().map(|w| f64::from(w.total())).sum();
+        let opacity: f64 = out.as_flattened().iter().copied().map(f64::from).sum();
         let tau: f64 = intervals
             .iter()
             .map(|i| i.sigma.iter().map(|s| f64::from(*s)).sum::<f64>() * f64::from(i.delta))
@@ -48,7 +86,7 @@ fn a_homogeneous_medium_has_the_opacity_of_beer_and_lambert() {
         let truth = -(-tau).exp_m1();
         assert!((opacity / truth - 1.0).abs() < 1e-5, "depth {depth}: {opacity} is not {truth}");
         assert!((f64::from(left) - (-tau).exp()).abs() < 1e-5 * (-tau).exp());
-        let persistent: f64 = out.iter().map(|w| f64::from(w.weight[0])).sum();
+        let persistent: f64 = out.iter().map(|w| f64::from(w[0])).sum();
         assert!((persistent / opacity - 0.5).abs() < 1e-5, "streams share by density");
     }
 }
@@ -69,11 +107,13 @@ fn extreme_densities_and_lengths_stay_finite_both_ways() {
 
 fn check_finite(intervals: &[Interval; 3]) {
     let (out, left) = composited(intervals);
-    let sum = out.iter().map(Weighted::total).sum::<f32>() + left;
+    let sum = out.as_flattened().iter().sum::<f32>() + left;
     assert!((sum - 1.0).abs() < 1e-5, "{intervals:?} sums to {sum}");
-    let mut gradient = [[f32::NAN; 3]; 3];
-    backward(intervals, &out, left, &[[1.0, -2.0, 0.5]; 3], 3.0, &mut gradient);
-    assert!(gradient.iter().flatten().all(|g| g.is_finite()), "{intervals:?} has the gradient {gradient:?}");
+    let gradient = gradient_of(intervals, &[[1.0, -2.0, 0.5]; 3], 3.0);
+    assert!(
+        gradient.as_flattened().iter().all(|g| g.is_finite()),
+        "{intervals:?} has the gradient {gradient:?}"
+    );
 }
 
 /// Analytic against f64 differences through both branches of φ and φ'.
@@ -87,9 +127,7 @@ fn gradient_is_the_derivative_for_thin_and_thick_intervals() {
             delta,
             t: 0.0,
         });
-        let (out, left) = composited(&intervals);
-        let mut gradient = [[0.0; 3]; 3];
-        backward(&intervals, &out, left, &g, d_left, &mut gradient);
+        let gradient = gradient_of(&intervals, &g, d_left);
         for k in 0..3 {
             for s in 0..3 {
                 let at = |h: f64| value(&intervals, &g, d_left, (k, s, h));

@@ -58,26 +58,30 @@ impl DensityGrid {
         ((slice as u32 * self.dims.z + z) * self.dims.y + y) as usize * self.dims.x as usize + x as usize
     }
 
-    /// As [`Self::index`], of many `points` (x, y, z rows).
+    /// As [`Self::index`], of many `points` (x, y, z rows) in a slice each.
     #[inline(always)]
-    pub fn indices(&self, points: &[[f32; STRIDE]; 3], slice: usize) -> [u32; STRIDE] {
+    pub fn indices(&self, points: &[[f32; STRIDE]; 3], slices: &[u32; STRIDE]) -> [u32; STRIDE] {
         let mut index = [0; STRIDE];
         let (dims, per_unit) = (self.dims, self.per_unit);
-        let first = slice as u32 * dims.z;
         for n in 0..STRIDE {
             let (x, _) = floor_within(points[0][n] * per_unit.x, (dims.x - 1) as f32);
             let (y, _) = floor_within(points[1][n] * per_unit.y, (dims.y - 1) as f32);
             let (z, _) = floor_within(points[2][n] * per_unit.z, (dims.z - 1) as f32);
-            index[n] = ((first + z) * dims.y + y) * dims.x + x;
+            index[n] = ((slices[n] * dims.z + z) * dims.y + y) * dims.x + x;
         }
         index
     }
 
     /// Adds the σ of the cells that hold `points` (x, y, z rows) to `out`.
     #[inline(always)]
-    pub fn add_at(&self, points: &[[f32; STRIDE]; 3], slice: usize, out: &mut [f32; STRIDE]) {
-        for (out, n) in out.iter_mut().zip(self.indices(points, slice)) {
-            *out += self.sigma[n as usize];
+    pub fn add_at(&self, points: &[[f32; STRIDE]; 3], slices: &[u32; STRIDE], out: &mut [f32; STRIDE]) {
+        let indices = self.indices(points, slices);
+        let mut sigma = [0.0; STRIDE];
+        for n in 0..STRIDE {
+            sigma[n] = self.sigma[indices[n] as usize];
+        }
+        for n in 0..STRIDE {
+            out[n] += sigma[n];
         }
     }
 

@@ -4,7 +4,7 @@ use glam::Vec2;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::composite::{self, Interval, Weighted};
+use super::composite::{Intervals, Weights};
 use super::forward::{Chunk, Model, RayInput, Tracer};
 use super::rays::{View, pixel_directions};
 use super::refined::{reduced, refined_camera};
@@ -95,62 +95,47 @@ impl WithSimd for DepthPass<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Vec<Traced> {
         let Self { model, stream, views, inputs, sampling, spread } = self;
-        let n = sampling.count;
-        let (mut chunk, mut tracer) = (Chunk::default(), Tracer::default());
-        let mut alone = vec![Weighted::default(); n];
+        let (mut chunk, mut tracer, mut alone) = (Chunk::default(), Tracer::default(), Weights::default());
         let mut out = Vec::with_capacity(inputs.len());
         for inputs in inputs.chunks(CHUNK_RAYS) {
             chunk.densities(simd, &mut tracer, model, views, inputs, sampling);
+            chunk.intervals.keep_stream(stream as usize);
+            alone.find(simd, &chunk.intervals);
             for r in 0..inputs.len() {
-                let range = r * n..(r + 1) * n;
-                out.push(trace(
-                    &mut chunk.intervals[range.clone()],
-                    &chunk.weighted[range],
-                    &mut alone,
-                    stream as usize,
-                    spread,
-                ));
+                out.push(trace(&chunk.intervals, &chunk.weights, &alone, r, stream as usize, spread));
             }
         }
         out
     }
 }
 
-/// One ray: composites stream `s` again as if it were alone.
+/// Ray number `r`, by its weights with all streams there and with stream `s` alone.
 #[inline(always)]
-fn trace(
-    intervals: &mut [Interval],
-    mixed: &[Weighted],
-    alone: &mut [Weighted],
-    s: usize,
-    spread: f32,
-) -> Traced {
+fn trace(intervals: &Intervals, mixed: &Weights, alone: &Weights, r: usize, s: usize, spread: f32) -> Traced {
+    let samples = || intervals.layout.of_ray(r);
     let mut shares = [0.0; 3];
-    for w in mixed {
-        (0..3).for_each(|k| shares[k] += w.weight[k]);
+    for w in samples().map(|n| mixed.at(n)) {
+        (0..3).for_each(|k| shares[k] += w[k]);
     }
-    for i in intervals.iter_mut() {
-        let sigma = i.sigma[s];
-        i.sigma = [0.0; 3];
-        i.sigma[s] = sigma;
-    }
-    let left = composite::weights(intervals, alone);
-    let median = median(intervals, alone, s, 0.5 * (1.0 - left));
-    let confidence = intervals.iter().zip(alone.iter()).map(|(i, w)| {
+    let median = median(intervals, alone, r, s);
+    let confidence = samples().map(|n| {
+        let i = intervals.at(n);
         let (from, to) = (i.t - 0.5 * i.delta, i.t + 0.5 * i.delta);
         let inside = (to.min(median + spread) - from.max(median - spread)).max(0.0);
-        if i.delta > 0.0 { w.weight[s] * (inside / i.delta).min(1.0) } else { 0.0 }
+        if i.delta > 0.0 { alone.weight[s][n] * (inside / i.delta).min(1.0) } else { 0.0 }
     });
     Traced { median, confidence: confidence.sum(), shares }
 }
 
-/// Distance at which the weights first add up to `half`, linear inside the interval; 0 if there is no weight.
+/// Distance at which the weights first add up to half of what the ray loses, linear inside the interval; 0 if there is no weight.
 #[inline(always)]
-fn median(intervals: &[Interval], weighted: &[Weighted], s: usize, half: f32) -> f32 {
+fn median(intervals: &Intervals, weights: &Weights, r: usize, s: usize) -> f32 {
+    let half = 0.5 * (1.0 - weights.left[r]);
     let mut sum = 0.0;
-    for (i, w) in intervals.iter().zip(weighted) {
-        let w = w.weight[s];
+    for n in intervals.layout.of_ray(r) {
+        let w = weights.weight[s][n];
         if w > 0.0 && sum + w >= half {
+            let i = intervals.at(n);
             return i.t + i.delta * ((half - sum) / w - 0.5);
         }
         sum += w;
@@ -161,16 +146,19 @@ fn median(intervals: &[Interval], weighted: &[Weighted], s: usize, half: f32) ->
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::render::composite::Interval;
 
     fn wall(sigma: impl Fn(usize) -> [f32; 3]) -> Vec<Interval> {
         (0..10).map(|k| Interval { sigma: sigma(k), delta: 0.1, t: 0.05 + 0.1 * k as f32 }).collect()
     }
 
-    fn run(mut intervals: Vec<Interval>) -> Traced {
-        let mut mixed = vec![Weighted::default(); intervals.len()];
-        composite::weights(&intervals, &mut mixed);
-        let mut alone = mixed.clone();
-        trace(&mut intervals, &mixed, &mut alone, 0, 0.1)
+    fn run(intervals: Vec<Interval>) -> Traced {
+        let mut intervals = Intervals::of_ray(&intervals);
+        let [mut mixed, mut alone] = [(); 2].map(|()| Weights::default());
+        mixed.find(pulp::Scalar::new(), &intervals);
+        intervals.keep_stream(0);
+        alone.find(pulp::Scalar::new(), &intervals);
+        trace(&intervals, &mixed, &alone, 0, 0, 0.1)
     }
 
     #[test]

@@ -2,18 +2,18 @@
 //!
 //! Training and rendering both go through here; training then walks the same buffers backwards.
 
-use std::ops::Range;
-
 use glam::{Vec2, Vec3};
 use pulp::Simd;
 
-use super::composite::{self, Interval, Weighted};
+use super::composite::{Intervals, RayLayout, Weights};
 use super::density_grid::{DensityGrid, STRIDE};
 use super::rays::{Ray, View};
-use super::sampler::{Sampler, Sampling, Steer};
+use super::sampler::{Lanes, RayLanes, Sampler, Sampling, Steer};
 use crate::field::mlp::{Packed, Precision};
 use crate::field::stream::{StreamActivations, StreamBatch, StreamSamples, StreamWeights};
 use crate::field::{Field, Stream, VIEW, view_encoding};
+use crate::simd::AlignedVec;
+use crate::simd::floats::{Column, ColumnMut};
 
 /// Running densities of the three streams. The actor's is over (u, v, inverse depth) in the camera's frustum.
 #[derive(Clone, Debug)]
@@ -123,46 +123,58 @@ impl<'a> Model<'a> {
     }
 }
 
-/// The density grids along one ray.
+/// The density grids along rays, a lane each.
 struct RayGrids<'a> {
     model: &'a Model<'a>,
-    input: &'a RayInput,
+    /// Image fractions.
+    uv: [Lanes; 2],
+    /// z-depth of a point at distance 1, before refinement.
+    z: Lanes,
     /// Slice of time of each grid.
-    slices: [usize; 3],
+    slices: [[u32; STRIDE]; 3],
 }
 
 impl RayGrids<'_> {
+    /// Which points at distances `t` are where the actor can be.
+    #[inline(always)]
+    fn near(&self, t: &Lanes) -> [bool; STRIDE] {
+        let mut near = [false; STRIDE];
+        for n in 0..STRIDE {
+            near[n] = t[n] * self.z[n] < self.model.field.actor_far;
+        }
+        near
+    }
+
     /// Actor coordinates of the points at distances `t`.
     #[inline(always)]
-    fn actor_points(&self, t: &[f32; STRIDE]) -> [[f32; STRIDE]; 3] {
-        let RayInput { uv, dir_cam, .. } = *self.input;
-        let mut points = [[uv.x; STRIDE], [uv.y; STRIDE], [0.0; STRIDE]];
+    fn actor_points(&self, t: &Lanes) -> [Lanes; 3] {
+        let [u, v] = self.uv;
+        let mut inverse = [0.0; STRIDE];
         for n in 0..STRIDE {
-            points[2][n] = self.model.actor_point(uv, t[n] * dir_cam.z).z;
+            inverse[n] = self.model.actor_point(Vec2::ZERO, t[n] * self.z[n]).z;
         }
-        points
+        [u, v, inverse]
     }
 }
 
 impl Steer for RayGrids<'_> {
     #[inline(always)]
-    fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
-        let Self { model, input, slices } = *self;
+    fn sigma(&self, points: &[Lanes; 3], t: &Lanes) -> [Lanes; 2] {
+        let Self { model, slices, .. } = self;
         let [persistent, dynamic, actor] = &model.grids.streams;
         let [mut stands, mut moves] = [[0.0; STRIDE]; 2];
         if model.streams[0] {
-            persistent.add_at(points, slices[0], &mut stands);
+            persistent.add_at(points, &slices[0], &mut stands);
         }
         if model.streams[1] {
-            dynamic.add_at(points, slices[1], &mut moves);
+            dynamic.add_at(points, &slices[1], &mut moves);
         }
-        let (z, far) = (input.dir_cam.z, model.field.actor_far);
-        if model.streams[2] && t[0] * z < far {
-            let points = self.actor_points(t);
+        let near = self.near(t);
+        if model.streams[2] && near != [false; STRIDE] {
             let mut sigma = [0.0; STRIDE];
-            actor.add_at(&points, slices[2], &mut sigma);
+            actor.add_at(&self.actor_points(t), &slices[2], &mut sigma);
             for n in 0..STRIDE {
-                moves[n] += if t[n] * z < far { sigma[n] } else { 0.0 };
+                moves[n] += if near[n] { sigma[n] } else { 0.0 };
             }
         }
         [stands, moves]
@@ -187,12 +199,6 @@ pub struct RayInput {
 pub struct TracedRay {
     /// Its geometry.
     pub ray: Ray,
-    /// Light left behind the last interval.
-    pub left: f32,
-    /// Σ w c over streams and intervals, before background and exposure.
-    pub rgb: [f32; 3],
-    /// Σ w^d β^d + w^a β^a.
-    pub beta: f32,
     /// Spherical harmonics of the viewing direction.
     view: [f32; VIEW],
 }
@@ -202,7 +208,7 @@ pub struct TracedRay {
 pub struct Tracer {
     /// Places samples, and counts what that was spared.
     pub sampler: Sampler,
-    edges: Vec<f32>,
+    edges: Vec<Lanes>,
     /// Densities in the order of a batch.
     sigma: Vec<f32>,
     /// What the networks of each stream left for the way back.
@@ -218,16 +224,20 @@ pub struct Chunk {
     codes: [Vec<f32>; 3],
     /// The rays in order.
     pub rays: Vec<TracedRay>,
-    /// `[rays * count]`.
-    pub intervals: Vec<Interval>,
-    /// `[rays * count]`.
-    pub weighted: Vec<Weighted>,
+    /// Of each ray as many, numbered by their layout.
+    pub intervals: Intervals,
+    /// What the intervals give to their rays.
+    pub weights: Weights,
     /// Which samples each stream is evaluated at; after [`Self::evaluate`] those that are not faint.
     pub batches: [StreamBatch; 3],
     /// Samples at which each stream has a density, faint or not, and the cell of its density grid that each is in.
     pub cells: [Vec<Placed>; 3],
-    /// What each stream said; zero where it was not evaluated.
+    /// What each stream said; zero where it was not evaluated, and left as it was by a stream without a batch.
     pub samples: [StreamSamples; 3],
+    /// Σ w c over streams and intervals of each ray, before background and exposure.
+    pub rgb: [AlignedVec; 3],
+    /// Σ w^d β^d + w^a β^a of each ray.
+    pub beta: AlignedVec,
 }
 
 /// Which samples of a stream are too faint for more than their density to be looked at; by default none are.
@@ -240,11 +250,11 @@ pub struct Faint {
 }
 
 impl Faint {
-    /// Whether stream `s` is too faint at a sample.
+    /// Whether stream `s` is too faint at sample number `n`.
     #[inline(always)]
-    fn is(self, s: usize, interval: &Interval, weighted: &Weighted) -> bool {
+    fn is(self, s: usize, intervals: &Intervals, weights: &Weights, n: usize) -> bool {
         let price = if s > 0 { self.transient } else { 0.0 };
-        weighted.weight[s].max(price * interval.sigma[s] * interval.delta) < self.share
+        weights.weight[s][n].max(price * intervals.sigma[s][n] * intervals.delta[n]) < self.share
     }
 }
 
@@ -271,7 +281,7 @@ impl Chunk {
     ) {
         self.place(tracer, model, views, inputs, sampling);
         self.encode(model);
-        self.evaluate(simd, tracer, model, sampling.count, Faint::default());
+        self.evaluate(simd, tracer, model, Faint::default());
     }
 
     /// As [`Self::forward`], but densities and weights alone: colours and uncertainty are not computed.
@@ -288,7 +298,7 @@ impl Chunk {
         self.place(tracer, model, views, inputs, sampling);
         self.encode(model);
         self.find_densities(simd, tracer, model, false);
-        self.weigh(sampling.count);
+        self.weights.find(simd, &self.intervals);
     }
 
     /// Densities at all samples of the batches, and nothing else of the streams unless their colours are asked for later.
@@ -302,19 +312,8 @@ impl Chunk {
             let code = |r: usize| &codes[s][r * net.code..];
             net.density(simd, &w, &batches[s], &mut activations[s], colours, code, sigma);
             for (&k, sigma) in batches[s].sample.iter().zip(&*sigma) {
-                intervals[k as usize].sigma[s] = *sigma;
+                intervals.sigma[s][k as usize] = *sigma;
             }
-        }
-    }
-
-    /// Weights of all samples, `n` a ray, by their densities.
-    #[inline(always)]
-    fn weigh(&mut self, n: usize) {
-        let Self { rays, intervals, weighted, .. } = self;
-        weighted.resize(intervals.len(), Weighted::default());
-        for (r, ray) in rays.iter_mut().enumerate() {
-            let range = r * n..(r + 1) * n;
-            ray.left = composite::weights(&intervals[range.clone()], &mut weighted[range]);
         }
     }
 
@@ -327,32 +326,32 @@ impl Chunk {
         }
     }
 
-    /// Evaluates the streams at the placed and encoded samples, `n` a ray, and composites.
+    /// Evaluates the streams at the placed and encoded samples, and composites.
     ///
     /// Where a stream is faint only its density is looked at, which is then done first: such samples leave its batch, and its
     /// colour and uncertainty count as zero there.
     #[inline(always)]
-    pub fn evaluate<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, n: usize, faint: Faint) {
+    pub fn evaluate<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, faint: Faint) {
         let first = faint.share > 0.0;
         if first {
             self.find_densities(simd, tracer, model, true);
-            self.weigh(n);
+            self.weights.find(simd, &self.intervals);
             self.drop_faint(tracer, model, faint);
         }
         self.find_colours(simd, tracer, model, first);
         if !first {
-            self.weigh(n);
+            self.weights.find(simd, &self.intervals);
         }
-        self.composite(n);
+        self.composite(simd);
     }
 
     /// Has samples that are faint leave the batches.
     #[inline(always)]
     fn drop_faint(&mut self, tracer: &mut Tracer, model: &Model, faint: Faint) {
-        let Self { intervals, weighted, batches, .. } = self;
+        let Self { intervals, weights, batches, .. } = self;
         for (s, batch) in batches.iter_mut().enumerate() {
             let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
-            let keep = |k: usize| !faint.is(s, &intervals[k], &weighted[k]);
+            let keep = |n: usize| !faint.is(s, intervals, weights, n);
             net.retain(&w, batch, &mut tracer.activations[s], keep);
         }
     }
@@ -362,38 +361,38 @@ impl Chunk {
     fn find_colours<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, known: bool) {
         let Self { codes, rays, intervals, batches, samples, .. } = self;
         for s in 0..3 {
-            samples[s].reset(intervals.len());
             let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
             if batches[s].is_empty() {
                 continue;
             }
+            samples[s].reset(intervals.layout.len());
             let code = |r: usize| &codes[s][r * net.code..];
             let view = |r: usize| &rays[r].view[..];
             let activations = &mut tracer.activations[s];
             net.forward(simd, &w, &batches[s], activations, known, code, view, &mut samples[s]);
-            for &k in &batches[s].sample {
-                intervals[k as usize].sigma[s] = samples[s].sigma[k as usize];
+            if !known {
+                for &k in &batches[s].sample {
+                    intervals.sigma[s][k as usize] = samples[s].sigma[k as usize];
+                }
             }
         }
     }
 
-    /// Colours and uncertainties of the rays, of `n` samples each.
+    /// Colours and uncertainties of the rays.
     #[inline(always)]
-    fn composite(&mut self, n: usize) {
-        let Self { rays, weighted, samples, .. } = self;
-        for (r, ray) in rays.iter_mut().enumerate() {
-            ray.rgb = [0.0; 3];
-            ray.beta = 0.0;
-            for k in r * n..(r + 1) * n {
-                for s in 0..3 {
-                    let w = weighted[k].weight[s];
-                    for c in 0..3 {
-                        ray.rgb[c] += w * samples[s].rgb[k][c];
-                    }
-                    if s > 0 {
-                        ray.beta += w * samples[s].beta[k];
-                    }
-                }
+    fn composite<S: Simd>(&mut self, simd: S) {
+        let Self { intervals, weights, batches, samples, rgb, beta, .. } = self;
+        let layout = intervals.layout;
+        rgb.iter_mut().chain([&mut *beta]).for_each(|column| column.zero(layout.width()));
+        for s in 0..3 {
+            if batches[s].is_empty() {
+                continue;
+            }
+            for (values, out) in samples[s].rgb.iter().zip(&mut *rgb) {
+                add_weighted(simd, layout, &weights.weight[s], values, out);
+            }
+            if s > 0 {
+                add_weighted(simd, layout, &weights.weight[s], &samples[s].beta, beta);
             }
         }
     }
@@ -408,97 +407,112 @@ impl Chunk {
         inputs: &[RayInput],
         sampling: &Sampling,
     ) {
-        let Tracer { sampler, edges, .. } = tracer;
-        let n = sampling.count;
-        let field = model.field;
-        let [_, grid_d, grid_a] = &model.grids.streams;
         self.rays.clear();
-        self.intervals.clear();
-        edges.resize(n + 1, 0.0);
+        self.intervals.reset(RayLayout { rays: inputs.len(), samples: sampling.count });
         for s in 0..3 {
             self.batches[s].clear();
             self.cells[s].clear();
-        }
-        for s in 0..3 {
-            let width = field.nets[s].as_ref().map_or(0, |net| net.code);
+            let width = model.field.nets[s].as_ref().map_or(0, |net| net.code);
             self.codes[s].resize(inputs.len() * width, 0.0);
         }
-        for (r, input) in inputs.iter().enumerate() {
+        tracer.edges.resize(sampling.count + 1, [0.0; STRIDE]);
+        for inputs in inputs.chunks(STRIDE) {
+            self.place_rays(tracer, model, views, inputs, sampling);
+        }
+    }
+
+    /// Places the samples of some rays that follow those that are placed.
+    #[inline(always)]
+    fn place_rays(
+        &mut self,
+        tracer: &mut Tracer,
+        model: &Model,
+        views: &[View],
+        inputs: &[RayInput],
+        sampling: &Sampling,
+    ) {
+        let Tracer { sampler, edges, .. } = tracer;
+        let (field, first) = (model.field, self.rays.len());
+        let mut grids =
+            RayGrids { model, uv: [[0.0; STRIDE]; 2], z: [0.0; STRIDE], slices: [[0; STRIDE]; 3] };
+        let mut rays = RayLanes::default();
+        let [mut jitter, mut times] = [[0.0; STRIDE]; 2];
+        for (n, input) in inputs.iter().enumerate() {
             let view = &views[input.view as usize];
             let ray = view.ray(input.dir_cam, field.normalisation.extent, field.near);
+            rays.set(n, &ray);
+            (jitter[n], times[n]) = (input.jitter, view.time);
+            (grids.uv[0][n], grids.uv[1][n], grids.z[n]) = (input.uv.x, input.uv.y, input.dir_cam.z);
             for s in 1..3 {
+                grids.slices[s][n] = model.grids.streams[s].slice(view.time) as u32;
                 if let (Some(code), Some(at)) = (&field.codes[s], view.code_knots[s]) {
                     let gamma = &field.weights[field.layout.streams[s].code.clone()];
-                    code.evaluate(gamma, at, &mut self.codes[s][r * code.width..(r + 1) * code.width]);
+                    let of_ray = (first + n) * code.width..(first + n + 1) * code.width;
+                    code.evaluate(gamma, at, &mut self.codes[s][of_ray]);
                 }
-            }
-            let (slice_d, slice_a) = (grid_d.slice(view.time), grid_a.slice(view.time));
-            let steer = RayGrids { model, input, slices: [0, slice_d, slice_a] };
-            let hit = sampler.edges(&ray, sampling, input.jitter, &steer, edges);
-            if hit {
-                self.intervals.extend(edges.windows(2).map(|e| Interval {
-                    sigma: [0.0; 3],
-                    delta: e[1] - e[0],
-                    t: 0.5 * (e[0] + e[1]),
-                }));
-                self.place_ray(&steer, &ray, r, view.time, n);
-            } else {
-                self.intervals.resize((r + 1) * n, Interval::default());
             }
             let unit = ray.dir.normalize_or_zero();
-            self.rays.push(TracedRay { ray, left: 1.0, rgb: [0.0; 3], beta: 0.0, view: view_encoding(unit) });
+            self.rays.push(TracedRay { ray, view: view_encoding(unit) });
         }
-    }
-
-    /// Has the streams evaluated at the `count` samples of ray number `r` where the density grids say that something is there.
-    #[inline(always)]
-    fn place_ray(&mut self, grids: &RayGrids, ray: &Ray, r: usize, time: f32, count: usize) {
-        let (model, dir_cam) = (grids.model, grids.input.dir_cam);
-        let far = model.field.actor_far;
-        for first in (r * count..(r + 1) * count).step_by(STRIDE) {
-            let intervals = &self.intervals[first..self.intervals.len().min(first + STRIDE)];
-            let mut t = [0.0; STRIDE];
-            t.iter_mut().zip(intervals).for_each(|(t, i)| *t = i.t);
-            let mut points = [[0.0; STRIDE]; 3];
-            for axis in 0..3 {
-                for n in 0..STRIDE {
-                    points[axis][n] = ray.origin[axis] + ray.dir[axis] * t[n];
-                }
+        sampler.edges(&rays, sampling, &jitter, &grids, edges);
+        let mut hits = [false; STRIDE];
+        (0..STRIDE).for_each(|n| hits[n] = rays.hits(n));
+        for (k, edges) in edges.windows(2).enumerate() {
+            let [mut t, mut delta] = [[0.0; STRIDE]; 2];
+            for n in 0..STRIDE {
+                t[n] = 0.5 * (edges[0][n] + edges[1][n]);
+                delta[n] = edges[1][n] - edges[0][n];
             }
-            let len = intervals.len();
+            let number = self.intervals.layout.number(first, k);
+            self.intervals.t[number..number + STRIDE].copy_from_slice(&t);
+            self.intervals.delta[number..number + STRIDE].copy_from_slice(&delta);
+            let points = rays.points(&t);
             for s in (0..2).filter(|s| model.streams[*s]) {
-                self.push(grids, s, [first, r], &points, time, 0..len);
+                self.push(&grids, s, [number, first], &points, &times, &hits);
             }
-            // Distances increase along the ray.
-            let near = t[..len].partition_point(|t| *t * dir_cam.z < far);
-            if model.streams[2] && near > 0 {
-                let points = grids.actor_points(&t);
-                self.push(grids, 2, [first, r], &points, time, 0..near);
+            let mut near = grids.near(&t);
+            (0..STRIDE).for_each(|n| near[n] &= hits[n]);
+            if model.streams[2] && near != [false; STRIDE] {
+                self.push(&grids, 2, [number, first], &grids.actor_points(&t), &times, &near);
             }
         }
     }
 
-    /// Has stream `s` evaluated at those of the lanes of `points` where its density grid says that something is there; they
-    /// are the samples from number `first` on, of ray number `ray`.
+    /// Has stream `s` evaluated at those of the `lanes` of `points` where its density grid says that something is there; the first is
+    /// sample number `number`, of ray number `ray`, and the others follow.
     #[inline(always)]
     fn push(
         &mut self,
         grids: &RayGrids,
         s: usize,
-        [first, ray]: [usize; 2],
-        points: &[[f32; STRIDE]; 3],
-        time: f32,
-        lanes: Range<usize>,
+        [number, ray]: [usize; 2],
+        points: &[Lanes; 3],
+        times: &Lanes,
+        lanes: &[bool; STRIDE],
     ) {
-        let model = grids.model;
-        let grid = &model.grids.streams[s];
-        let cells = grid.indices(points, grids.slices[s]);
-        for n in lanes {
-            if grid.sigma[cells[n] as usize] >= model.grids.threshold[s] {
+        let (grid, threshold) = (&grids.model.grids.streams[s], grids.model.grids.threshold[s]);
+        let cells = grid.indices(points, &grids.slices[s]);
+        for n in 0..STRIDE {
+            if lanes[n] && grid.sigma[cells[n] as usize] >= threshold {
                 let p = Vec3::from_array([0, 1, 2].map(|axis| points[axis][n]));
-                self.batches[s].push(first + n, ray, p, time);
-                self.cells[s].push(Placed { sample: (first + n) as u32, cell: cells[n] });
+                self.batches[s].push(number + n, ray + n, p, times[n]);
+                self.cells[s].push(Placed { sample: (number + n) as u32, cell: cells[n] });
             }
         }
+    }
+}
+
+/// Adds the weight times the value of every sample to its ray's number in `out`.
+#[inline(always)]
+fn add_weighted<S: Simd>(simd: S, layout: RayLayout, weights: &[f32], values: &[f32], out: &mut [f32]) {
+    let [weights, values] = [weights, values].map(|column| Column::new(simd, column));
+    let vectors = layout.vectors::<S>();
+    let mut out = ColumnMut::new(simd, out);
+    for rays in 0..vectors {
+        let mut sum = out.at(rays);
+        for at in (rays..layout.len() / S::F32_LANES).step_by(vectors) {
+            sum += weights.at(at) * values.at(at);
+        }
+        out.set(rays, sum);
     }
 }

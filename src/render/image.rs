@@ -87,38 +87,36 @@ impl WithSimd for RenderPass<'_> {
         for inputs in inputs.chunks(CHUNK_RAYS) {
             chunk.forward(simd, &mut tracer, model, views, inputs, sampling);
             for r in 0..inputs.len() {
-                out.push(pixel(&chunk, r, sampling.count, model, exposure));
+                out.push(pixel(&chunk, r, model, exposure));
             }
         }
         out
     }
 }
 
-fn pixel(chunk: &Chunk, r: usize, count: usize, model: &Model, exposure: [f32; 6]) -> Pixel {
-    let ray = &chunk.rays[r];
-    let weighted = &chunk.weighted[r * count..(r + 1) * count];
+fn pixel(chunk: &Chunk, r: usize, model: &Model, exposure: [f32; 6]) -> Pixel {
     let mut opacity = [0.0; 3];
-    for w in weighted {
+    for w in chunk.intervals.layout.of_ray(r).map(|n| chunk.weights.at(n)) {
         for s in 0..3 {
-            opacity[s] += w.weight[s];
+            opacity[s] += w[s];
         }
     }
     let rgb = std::array::from_fn(|c| {
-        let raw = ray.rgb[c] + ray.left * model.field.background[c];
+        let raw = chunk.rgb[c][r] + chunk.weights.left[r] * model.field.background[c];
         (exposure[c].exp() * raw + exposure[3 + c]).clamp(0.0, 1.0)
     });
-    let depth = median_depth(chunk, r, count) * ray.ray.refined_cam.z;
+    let depth = median_depth(chunk, r) * chunk.rays[r].ray.refined_cam.z;
     Pixel { rgb, depth, opacity }
 }
 
 /// Distance at which half of the ray's own opacity has been met, linear inside the interval.
-fn median_depth(chunk: &Chunk, r: usize, count: usize) -> f32 {
-    let half = 0.5 * (1.0 - chunk.rays[r].left);
+fn median_depth(chunk: &Chunk, r: usize) -> f32 {
+    let half = 0.5 * (1.0 - chunk.weights.left[r]);
     let mut sum = 0.0;
-    for k in r * count..(r + 1) * count {
-        let w = chunk.weighted[k].total();
+    for n in chunk.intervals.layout.of_ray(r) {
+        let w = chunk.weights.total(n);
         if sum + w >= half && w > 0.0 {
-            let i = &chunk.intervals[k];
+            let i = chunk.intervals.at(n);
             return i.t + i.delta * ((half - sum) / w - 0.5);
         }
         sum += w;

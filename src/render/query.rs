@@ -73,7 +73,7 @@ impl<'a> Query<'a> {
             let pass = ColourPass { query: self, weights, batch: &mut batch, views: &views, out: &mut out };
             pulp::Arch::new().dispatch(pass);
         }
-        out.rgb
+        (0..points.len()).map(|n| [0, 1, 2].map(|c| out.rgb[c][n])).collect()
     }
 }
 

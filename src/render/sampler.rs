@@ -1,10 +1,17 @@
-//! Where along a ray to look: intervals of equal weight under the running density grids.
+//! Where along rays to look: intervals of equal weight under the running density grids.
+//!
+//! Rays go through the grids side by side, a lane each: a step of one waits for its own last step only, and neighbouring rays look
+//! up neighbouring cells.
 
 use super::density_grid::STRIDE;
 use super::rays::Ray;
+use crate::simd::floor_within;
 
-/// Most steps a ray takes through the density grids; whole blocks of [`STRIDE`].
+/// Most steps a ray takes through the density grids.
 const MAX_STEPS: usize = 768;
+
+/// Steps after which is looked whether any ray goes on.
+const LOOK_EVERY: usize = 4;
 
 /// See [`Sampler`]: a share of the light that does not show.
 const SATURATED: f32 = 1e-4;
@@ -26,30 +33,65 @@ pub struct Sampling {
     pub sharpness: f32,
 }
 
-/// What steers the samples of one ray: the streams' running densities along it.
+/// A number for each of the rays that are sampled together.
+pub type Lanes = [f32; STRIDE];
+
+/// What steers the samples of some rays: the streams' running densities along them.
 ///
 /// A trait and not a closure, which would not be inlined, and so compiled without the caller's vector features.
 pub trait Steer {
-    /// σ of what stands and of what moves, at some points of the ray (x, y, z rows) and their distances.
-    fn sigma(&self, points: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2];
+    /// σ of what stands and of what moves, at a point of each ray (x, y, z rows) and its distance.
+    fn sigma(&self, points: &[Lanes; 3], t: &Lanes) -> [Lanes; 2];
 }
 
-/// Products of all factors before each, and of all of them.
-///
-/// Blocks do not wait for one another: what is left before a block comes to it afterwards.
-#[inline(always)]
-fn products(factors: [f32; STRIDE]) -> ([f32; STRIDE], f32) {
-    let (mut before, mut product) = ([0.0; STRIDE], 1.0);
-    for (before, factor) in before.iter_mut().zip(factors) {
-        *before = product;
-        product *= factor;
+/// Rays that are sampled together, a lane each; those that miss the box, and lanes that are none, are of length 0.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct RayLanes {
+    origin: [Lanes; 3],
+    dir: [Lanes; 3],
+    start: Lanes,
+    length: Lanes,
+}
+
+impl RayLanes {
+    /// Adds `ray` as lane `n`.
+    pub fn set(&mut self, n: usize, ray: &Ray) {
+        for axis in 0..3 {
+            (self.origin[axis][n], self.dir[axis][n]) = (ray.origin[axis], ray.dir[axis]);
+        }
+        let (start, end) = ray.range;
+        if start < end {
+            (self.start[n], self.length[n]) = (start, end - start);
+        }
     }
-    (before, product)
+
+    /// Whether lane `n` is a ray that meets the box.
+    pub fn hits(&self, n: usize) -> bool {
+        self.length[n] > 0.0
+    }
+
+    /// The points at distances `t`, x, y and z rows.
+    #[inline(always)]
+    pub fn points(&self, t: &Lanes) -> [Lanes; 3] {
+        let mut points = [[0.0; STRIDE]; 3];
+        for axis in 0..3 {
+            let (origin, dir) = (&self.origin[axis], &self.dir[axis]);
+            for n in 0..STRIDE {
+                points[axis][n] = origin[n] + dir[n] * t[n];
+            }
+        }
+        points
+    }
 }
 
 /// Buffers of one thread.
 pub struct Sampler {
-    weights: Vec<f32>,
+    /// Weight of every step of the rays.
+    weights: Vec<Lanes>,
+    /// The weights of all steps before it.
+    below: Vec<Lanes>,
+    /// The step from which on edges are behind it.
+    steps: Vec<[u32; STRIDE]>,
     /// A ray is cut off where what stands leaves less than this of its light.
     saturated: f32,
     /// Steps through the grids that rays have taken, so far.
@@ -60,7 +102,8 @@ pub struct Sampler {
 
 impl Default for Sampler {
     fn default() -> Self {
-        Self { weights: vec![0.0; MAX_STEPS], saturated: SATURATED, taken: 0, spared: 0 }
+        let [weights, below] = [0; 2].map(|_| vec![[0.0; STRIDE]; MAX_STEPS]);
+        Self { weights, below, steps: Vec::new(), saturated: SATURATED, taken: 0, spared: 0 }
     }
 }
 
@@ -72,95 +115,147 @@ impl Sampler {
     }
 }
 
+/// What rays have met on their way through the grids.
+struct Walked {
+    /// Length of a step.
+    dt: Lanes,
+    /// Steps up to where a ray was cut off or has ended.
+    used: Lanes,
+    /// The weights of those.
+    total: Lanes,
+    /// Steps until all rays had ended.
+    steps: usize,
+}
+
 impl Sampler {
-    /// Writes `count + 1` increasing distances to `edges`; false if the ray misses the box.
+    /// Writes `count + 1` distances, which increase along every ray, to `edges`; zeros where there is no ray.
     ///
-    /// `jitter` in [0, 1) shifts all edges by a part of one interval's weight.
+    /// `jitter` in [0, 1) shifts all edges of a ray by a part of one interval's weight.
     #[inline(always)]
     pub fn edges(
         &mut self,
-        ray: &Ray,
+        rays: &RayLanes,
         sampling: &Sampling,
-        jitter: f32,
+        jitter: &Lanes,
         steer: &impl Steer,
-        edges: &mut [f32],
-    ) -> bool {
-        let (start, end) = ray.range;
-        if start >= end {
-            return false;
+        edges: &mut [Lanes],
+    ) {
+        let walked = self.walk(rays, sampling, steer);
+        self.divide(rays, sampling, jitter, &walked, edges);
+    }
+
+    /// Finds the weights of all steps.
+    #[inline(always)]
+    fn walk(&mut self, rays: &RayLanes, sampling: &Sampling, steer: &impl Steer) -> Walked {
+        let [mut steps, mut dt, mut scale] = [[0.0; STRIDE]; 3];
+        let mut most = 0.0f32;
+        for n in (0..STRIDE).filter(|n| rays.hits(*n)) {
+            steps[n] = (rays.length[n] / sampling.step).ceil().clamp(1.0, MAX_STEPS as f32);
+            dt[n] = rays.length[n] / steps[n];
+            scale[n] = sampling.sharpness * dt[n];
+            most = most.max(steps[n]);
         }
-        let steps = (((end - start) / sampling.step).ceil() as usize).clamp(1, MAX_STEPS);
-        let dt = (end - start) / steps as f32;
-        let (mut left, mut past) = (1.0f32, 1.0f32);
-        let mut totals = [0.0; STRIDE];
-        let mut used = 0;
-        let scale = sampling.sharpness * dt;
-        for block in self.weights.as_chunks_mut::<STRIDE>().0.iter_mut().take(steps.div_ceil(STRIDE)) {
+        let [mut left, mut past] = [[1.0; STRIDE]; 2];
+        let [mut total, mut used] = [[0.0; STRIDE]; 2];
+        let mut walked = 0;
+        for (step, weights) in self.weights.iter_mut().take(most as usize).enumerate() {
+            let at = step as f32;
             let mut t = [0.0; STRIDE];
-            for (n, t) in t.iter_mut().enumerate() {
-                *t = start + ((used + n) as f32 + 0.5) * dt;
-            }
-            let mut points = [[0.0; STRIDE]; 3];
-            for axis in 0..3 {
-                for n in 0..STRIDE {
-                    points[axis][n] = ray.origin[axis] + ray.dir[axis] * t[n];
-                }
-            }
-            let [mut stands, mut moves] = steer.sigma(&points, &t);
-            let mut alphas = [0.0; STRIDE];
             for n in 0..STRIDE {
-                // e^-tau to first order, and cheaper; only steers the samples.
-                let passes = |sigma: f32| 1.0 / (1.0 + sigma * scale);
-                alphas[n] = 1.0 - passes(stands[n] + moves[n]);
-                (stands[n], moves[n]) = (passes(stands[n]), passes(moves[n]));
+                t[n] = rays.start[n] + (at + 0.5) * dt[n];
             }
-            let ((stands, all), (moves, all_move)) = (products(stands), products(moves));
-            let mut ahead = [0.0; STRIDE];
+            let [stands, moves] = steer.sigma(&rays.points(&t), &t);
+            let [mut weight, mut goes_on] = [[0.0; STRIDE]; 2];
             for n in 0..STRIDE {
-                ahead[n] = left * stands[n];
-                block[n] = ahead[n] * (past * moves[n]).max(SEEN_PAST) * alphas[n];
-            }
-            let len = block.len().min(steps - used);
-            (left, past) = (left * all, past * all_move);
-            let mut seen = len;
-            if left < self.saturated {
                 // The step after which nothing is left is the last.
-                seen = ahead[1..len].iter().position(|left| *left < self.saturated).map_or(len, |n| n + 1);
-            }
-            if seen < STRIDE {
-                block[seen..].fill(0.0);
+                goes_on[n] = if (at < steps[n]) & (left[n] >= self.saturated) { 1.0 } else { 0.0 };
+                let alpha = 1.0 - passes((stands[n] + moves[n]) * scale[n]);
+                weight[n] = goes_on[n] * (left[n] * past[n].max(SEEN_PAST) * alpha);
             }
             for n in 0..STRIDE {
-                totals[n] += block[n];
+                left[n] *= passes(stands[n] * scale[n]);
+                past[n] *= passes(moves[n] * scale[n]);
+                total[n] += weight[n];
+                used[n] += goes_on[n];
             }
-            used += seen;
-            if left < self.saturated {
+            *weights = weight;
+            walked = step + 1;
+            if walked % LOOK_EVERY == 0 && goes_on.iter().sum::<f32>() == 0.0 {
                 break;
             }
         }
-        self.taken += used as u64;
-        self.spared += (steps - used) as u64;
-        let total = totals.iter().sum::<f32>();
-        let span = used as f32;
-        let floor = sampling.explore * total.max(0.05) / ((1.0 - sampling.explore) * span);
-        let total = total + floor * span;
-        let n = sampling.count;
-        let (mut bin, mut below) = (0, 0.0);
-        edges[0] = start;
-        for (k, edge) in edges[1..n].iter_mut().enumerate() {
-            let target = (k as f32 + 0.5 + jitter) / n as f32 * total;
-            while bin + 1 < used && below + self.weights[bin] + floor < target {
-                below += self.weights[bin] + floor;
-                bin += 1;
-            }
-            let inside = ((target - below) / (self.weights[bin] + floor)).clamp(0.0, 1.0);
-            *edge = start + (bin as f32 + inside) * dt;
-        }
-        edges[n] = start + span * dt;
-        // Rounding may let two edges meet; intervals of zero length are harmless, decreasing ones are not.
-        for k in 1..=n {
-            edges[k] = edges[k].max(edges[k - 1]);
-        }
-        true
+        let [of_rays, taken] = [steps, used].map(|steps| steps.iter().sum::<f32>() as u64);
+        self.taken += taken;
+        self.spared += of_rays - taken;
+        Walked { dt, used, total, steps: walked }
     }
+
+    /// Divides the weights, and a floor below them, into equal parts.
+    #[inline(always)]
+    fn divide(
+        &mut self,
+        rays: &RayLanes,
+        sampling: &Sampling,
+        jitter: &Lanes,
+        walked: &Walked,
+        edges: &mut [Lanes],
+    ) {
+        let count = sampling.count;
+        let Walked { dt, used, .. } = walked;
+        let [mut floor, mut total, mut per_weight] = [[0.0; STRIDE]; 3];
+        for n in 0..STRIDE {
+            let even = sampling.explore * walked.total[n].max(0.05) / (1.0 - sampling.explore);
+            floor[n] = even / used[n].max(1.0);
+            total[n] = walked.total[n] + floor[n] * used[n];
+            per_weight[n] = count as f32 / total[n];
+        }
+        // Edge number k + 1 is where the weights have come to (k + 1/2 + jitter) / count of all: of every step the first k that is
+        // behind it.
+        self.steps.clear();
+        self.steps.resize(count, [0; STRIDE]);
+        let mut sum = [0.0; STRIDE];
+        for (step, (weights, below)) in
+            self.weights.iter().zip(&mut self.below).take(walked.steps).enumerate()
+        {
+            *below = sum;
+            let mut behind = [0; STRIDE];
+            for n in 0..STRIDE {
+                sum[n] += weights[n] + floor[n];
+                let k = sum[n] * per_weight[n] - jitter[n] + 0.5;
+                behind[n] = floor_within(k, (count - 1) as f32).0;
+            }
+            for n in 0..STRIDE {
+                self.steps[behind[n] as usize][n] = step as u32 + 1;
+            }
+        }
+        let mut latest = [0; STRIDE];
+        let mut edge = rays.start;
+        edges[0] = edge;
+        for k in 1..count {
+            let [mut below, mut weight, mut bin] = [[0.0; STRIDE]; 3];
+            for n in 0..STRIDE {
+                latest[n] = latest[n].max(self.steps[k - 1][n]);
+                let step = latest[n].min((used[n] as u32).max(1) - 1) as usize;
+                (below[n], weight[n], bin[n]) = (self.below[step][n], self.weights[step][n], step as f32);
+            }
+            for n in 0..STRIDE {
+                let target = (k as f32 - 0.5 + jitter[n]) / count as f32 * total[n];
+                let inside = ((target - below[n]) / (weight[n] + floor[n])).clamp(0.0, 1.0);
+                let next = rays.start[n] + (bin[n] + inside) * dt[n];
+                // Rounding may let two edges meet; intervals of zero length are harmless, decreasing ones are not.
+                edge[n] = if next > edge[n] { next } else { edge[n] };
+            }
+            edges[k] = edge;
+        }
+        for n in 0..STRIDE {
+            edge[n] = edge[n].max(rays.start[n] + used[n] * dt[n]);
+        }
+        edges[count] = edge;
+    }
+}
+
+/// e^-tau to first order, and cheaper; only steers the samples.
+#[inline(always)]
+fn passes(tau: f32) -> f32 {
+    1.0 / (1.0 + tau)
 }

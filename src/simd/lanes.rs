@@ -49,13 +49,22 @@ fn keep_one_by_one(values: &mut [f32], layout: Layout, kept: &[u32], first: usiz
 mod tests {
     use super::*;
     use crate::rng::Rng;
-    use crate::simd::row_sums;
+    use crate::simd::add_quarter_sums;
 
     #[test]
     fn every_row_has_its_sum() {
         // Whole numbers, which no order of summing rounds.
-        let rows: [[f32; 16]; 16] = std::array::from_fn(|r| std::array::from_fn(|k| (r * r + 3 * k) as f32));
-        assert_eq!(row_sums(&rows), std::array::from_fn(|r| (16 * r * r + 360) as f32));
+        let rows: [[[f32; 16]; 4]; 3] = std::array::from_fn(|n| {
+            std::array::from_fn(|j| std::array::from_fn(|k| (100 * n + j * j + 3 * k) as f32))
+        });
+        let mut out = [[1.0; 16]; 3];
+        add_quarter_sums(&rows, &mut out);
+        for (n, out) in out.iter().enumerate() {
+            for j in 0..4 {
+                let sum: f32 = out[j..].iter().step_by(4).sum();
+                assert_eq!(sum, (4 + 16 * (100 * n + j * j) + 360) as f32);
+            }
+        }
     }
 
     #[test]

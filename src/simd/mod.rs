@@ -4,14 +4,17 @@
 //! they need no `unsafe`. Lanes are always samples, never features: every width gives the same forward result
 //! for every sample.
 
+pub mod floats;
 pub mod lanes;
 mod machine;
 pub mod matrix;
 
-pub use machine::{prefetch, row_sums};
+pub use machine::{add_quarter_sums, prefetch};
 
 use bytemuck::{Pod, Zeroable};
 use half::f16;
+
+use self::floats::Floats;
 
 /// Samples per tile: three AVX-512 vectors, six AVX2 vectors or twelve NEON vectors.
 ///
@@ -44,6 +47,12 @@ impl AlignedVec {
             self.len = len;
         }
     }
+
+    /// Makes the first `len` floats zeros, and room for them.
+    pub fn zero(&mut self, len: usize) {
+        self.reserve_len(len);
+        self[..len].fill(0.0);
+    }
 }
 
 impl std::ops::Deref for AlignedVec {
@@ -59,27 +68,16 @@ impl std::ops::DerefMut for AlignedVec {
     }
 }
 
-/// e^x to 2 ulp for x in [-87, 88], clamped outside; branch-free so that loops over it vectorise.
-///
-/// Cody–Waite reduction to |r| ≤ ln2/2, degree-6 polynomial, exponent by bit arithmetic.
+/// [`Floats::exp`] of one number; branch-free, so that loops over it vectorise.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
-    const LN2_HI: f32 = 0.693_359_4;
-    const LN2_LO: f32 = -2.121_944_4e-4;
-    // 1.5 * 2^23: adding it rounds to the nearest integer and leaves that integer in the low mantissa bits.
-    const ROUND: f32 = 12_582_912.0;
-    let x = x.clamp(-87.0, 88.0);
-    let shifted = x * std::f32::consts::LOG2_E + ROUND;
-    let n = shifted - ROUND;
-    let r = (x - n * LN2_HI) - n * LN2_LO;
-    let p = 1.0 / 720.0;
-    let p = p * r + 1.0 / 120.0;
-    let p = p * r + 1.0 / 24.0;
-    let p = p * r + 1.0 / 6.0;
-    let p = p * r + 0.5;
-    let p = (p * r) * r + r + 1.0;
-    let exponent = (shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127)) << 23;
-    p * f32::from_bits(exponent)
+    Floats::one(x).exp().value()
+}
+
+/// [`Floats::one_minus_exp_neg`] of one number.
+#[inline(always)]
+pub fn one_minus_exp_neg(x: f32) -> f32 {
+    Floats::one(x).one_minus_exp_neg().value()
 }
 
 /// sin(πx) and cos(πx) to 1.5e-7; branch-free, so that loops over it vectorise.
@@ -88,7 +86,7 @@ pub fn exp(x: f32) -> f32 {
 /// themselves, it is taken as that.
 #[inline(always)]
 pub fn sin_cos_pi(x: f32) -> (f32, f32) {
-    // As in `exp`: rounds to the nearest integer and leaves it in the low mantissa bits.
+    // As in `Floats::exp`: rounds to the nearest integer and leaves it in the low mantissa bits.
     const ROUND: f32 = 12_582_912.0;
     const LIMIT: f32 = 2_097_152.0;
     let x = x.clamp(-LIMIT, LIMIT);
@@ -149,15 +147,6 @@ pub fn dot(a: &[f32], b: &[f32]) -> f32 {
         }
     }
     sums.iter().sum::<f32>() + a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum::<f32>()
-}
-
-/// 1 - e^-x for x ≥ 0 without cancellation for thin samples.
-#[inline(always)]
-pub fn one_minus_exp_neg(x: f32) -> f32 {
-    // Below 0.25 the difference would lose two bits and more; the series' first neglected term is x^7/5040 < 2e-8 x.
-    let series =
-        x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0 - x * (1.0 / 120.0 - x * (1.0 / 720.0))))));
-    if x < 0.25 { series } else { 1.0 - exp(-x) }
 }
 
 #[cfg(test)]

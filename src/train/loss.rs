@@ -1,11 +1,18 @@
 //! The loss of one chunk of rays and its gradient with respect to everything that compositing saw.
+//!
+//! As in compositing, vectors hold samples of different rays.
 
+use std::ops::Range;
+
+use pulp::Simd;
 use serde::{Deserialize, Serialize};
 
 use self::flatness::Bend;
 use crate::field::stream::StreamSamples;
-use crate::render::composite::{Interval, Weighted};
-use crate::render::forward::Chunk;
+use crate::render::composite::{self, Intervals, LANES};
+use crate::render::forward::{Chunk, TracedRay};
+use crate::simd::AlignedVec;
+use crate::simd::floats::{Column, ColumnMut, Floats};
 use crate::train::moving::Volume;
 
 pub mod flatness;
@@ -94,20 +101,17 @@ pub struct ChunkLoss {
 /// Gradients of one chunk with respect to the outputs of the forward pass.
 #[derive(Default)]
 pub struct ChunkGradient {
-    /// With respect to w^s.
-    pub weight: Vec<[f32; 3]>,
-    /// With respect to σ^s.
-    pub sigma: Vec<[f32; 3]>,
-    /// With respect to σ, colour and β of each stream.
+    /// With respect to σ, colour and β of each stream that has a batch.
     pub samples: [StreamSamples; 3],
     /// With respect to the six exposure numbers of each ray.
     pub exposure: Vec<[f32; 6]>,
     /// What other losses ask of w^s, set before; empty: nothing.
     pub asked: Vec<[f32; 3]>,
     /// With respect to the disparity of each ray.
-    disparity: Vec<f32>,
-    /// Whether things move where the samples of a ray are.
-    moving: Vec<bool>,
+    disparity: AlignedVec,
+    /// 1 where things move where the samples are, else 0.
+    moves: AlignedVec,
+    targets: TargetColumns,
 }
 
 /// The colour that a ray should have, and how it was exposed.
@@ -134,177 +138,311 @@ pub struct Aims<'a> {
     pub moving: &'a Volume,
 }
 
+/// What rays should come to, as columns.
+#[derive(Default)]
+struct TargetColumns {
+    rgb: [AlignedVec; 3],
+    background: [AlignedVec; 3],
+    exposure: [AlignedVec; 6],
+    depth: AlignedVec,
+    /// z-depth of a point of the ray at distance 1.
+    z: AlignedVec,
+}
+
+impl TargetColumns {
+    /// Lanes behind the last ray are nobody's; what they hold is harmless.
+    fn fill(&mut self, targets: &[RayTarget], rays: &[TracedRay], width: usize) {
+        let Self { rgb, background, exposure, depth, z } = self;
+        let columns = rgb.iter_mut().chain(background).chain(exposure).chain([&mut *depth, &mut *z]);
+        columns.for_each(|column| column.zero(width));
+        z.fill(1.0);
+        for (r, (target, traced)) in targets.iter().zip(rays).enumerate() {
+            for c in 0..3 {
+                self.rgb[c][r] = target.rgb[c];
+                self.background[c][r] = target.background[c];
+            }
+            for c in 0..6 {
+                self.exposure[c][r] = target.exposure[c];
+            }
+            (self.depth[r], self.z[r]) = (target.depth, traced.ray.refined_cam.z);
+        }
+    }
+}
+
 /// Evaluates the loss of a traced chunk and fills `grad`. `scale` multiplies the whole gradient (1 / rays).
 #[inline(always)]
-pub fn backward(
+pub fn backward<S: Simd>(
+    simd: S,
     config: &LossConfig,
     chunk: &Chunk,
     aims: &Aims,
-    count: usize,
     scale: f32,
     grad: &mut ChunkGradient,
 ) -> ChunkLoss {
-    let Aims { targets, bends, moving } = *aims;
-    let total = chunk.intervals.len();
-    grad.weight.resize(total, [0.0; 3]);
-    grad.sigma.resize(total, [0.0; 3]);
-    grad.exposure.resize(targets.len(), [0.0; 6]);
-    for s in &mut grad.samples {
-        s.resize(total);
-    }
-    let bent = flatness::backward(config.flatness, chunk, bends, count, scale, &mut grad.disparity);
+    let layout = chunk.intervals.layout;
+    grad.exposure.resize(aims.targets.len(), [0.0; 6]);
+    grad.samples.iter_mut().for_each(|samples| samples.reserve(layout.len()));
+    grad.targets.fill(aims.targets, &chunk.rays, layout.width());
+    find_moving(aims.moving, chunk, &mut grad.moves);
+    let bent = flatness::backward(simd, config.flatness, chunk, aims.bends, scale, &mut grad.disparity);
     let mut loss = ChunkLoss { total: f64::from(bent), ..ChunkLoss::default() };
-    for (r, target) in targets.iter().enumerate() {
-        let ray = &chunk.rays[r];
-        let range = r * count..(r + 1) * count;
-        let beta = config.beta_min + ray.beta;
-        let precision = 1.0 / (beta * beta);
-        let mut squared = 0.0;
-        let mut d_rgb = [0.0; 3];
-        for c in 0..3 {
-            let gain = target.exposure[c].exp();
-            let raw = ray.rgb[c] + ray.left * target.background[c];
-            let colour = gain * raw + target.exposure[3 + c];
-            let error = colour - target.rgb[c];
-            squared += error * error;
-            let d = scale * precision * error;
-            d_rgb[c] = d * gain;
-            let d_exposure = scale * config.exposure;
-            grad.exposure[r][c] = d * gain * raw + d_exposure * target.exposure[c];
-            grad.exposure[r][3 + c] = d + d_exposure * target.exposure[3 + c];
+    let zero = Floats::new(simd, 0.0);
+    let mut gradient = vec![[zero; 3]; layout.samples];
+    for rays in 0..layout.vectors::<S>() {
+        let mut terms = Terms { simd, config, chunk, scale, rays, cost: zero };
+        let composited = terms.colours(grad, &mut loss);
+        terms.weights(&composited, grad, &mut gradient);
+        composite::backward(simd, &chunk.intervals, &chunk.weights, rays, &mut gradient, composited.left);
+        terms.densities(&gradient, &mut grad.samples);
+        for cost in terms.of_rays(terms.cost) {
+            loss.total += f64::from(cost);
         }
-        loss.squared += f64::from(squared) / 3.0;
-        loss.total += f64::from(0.5 * squared * precision + beta.ln());
-        let d_beta = scale * (1.0 / beta - squared * precision / beta);
-        let d_left = (0..3).map(|c| d_rgb[c] * target.background[c]).sum::<f32>();
-        let exposure = target.exposure.iter().map(|e| e * e).sum::<f32>();
-        let mut extra = 0.5 * config.exposure * exposure;
-        let cover = covers(&chunk.weighted[range.clone()]);
-        let veil = [0.0, 1.0, 1.0].map(|v| v * config.veil);
-        extra += (0..3).map(|s| veil[s] * cover[s] * (1.0 - cover[s])).sum::<f32>();
-        // All of them first: these reads are from all over memory, and so do not wait for one another.
-        grad.moving.clear();
-        grad.moving.extend(chunk.intervals[range.clone()].iter().map(|i| moving.contains(ray.ray.at(i.t))));
-        for k in range.clone() {
-            let prices = config.prices(grad.moving[k - range.start]);
-            for s in 0..3 {
-                let w = chunk.weighted[k].weight[s];
-                let rgb = chunk.samples[s].rgb[k];
-                let mut g = grad.asked.get(k).map_or(0.0, |asked| asked[s]);
-                for c in 0..3 {
-                    g += d_rgb[c] * rgb[c];
-                    grad.samples[s].rgb[k][c] = d_rgb[c] * w;
-                }
-                extra += prices[s] * w;
-                g += scale * (prices[s] + veil[s] * (1.0 - 2.0 * cover[s]));
-                if s > 0 {
-                    g += d_beta * chunk.samples[s].beta[k];
-                    grad.samples[s].beta[k] = d_beta * w;
-                }
-                grad.weight[k][s] = g;
-            }
-        }
-        if config.distortion > 0.0 {
-            extra += config.distortion
-                * distortion(
-                    &chunk.intervals[range.clone()],
-                    &chunk.weighted[range.clone()],
-                    scale * config.distortion,
-                    &mut grad.weight[range.clone()],
-                );
-        }
-        if target.depth > 0.0 {
-            for k in range.clone() {
-                let price = config.depth * wrong_depth(chunk.intervals[k].t, target.depth);
-                extra += price * chunk.weighted[k].total();
-                for g in &mut grad.weight[k] {
-                    *g += scale * price;
-                }
-            }
-        }
-        if config.flatness > 0.0 {
-            let d = grad.disparity[r] / ray.ray.refined_cam.z;
-            for k in range.clone() {
-                for g in &mut grad.weight[k] {
-                    *g += d * flatness::inverse(chunk.intervals[k].t);
-                }
-            }
-        }
-        if config.entropy > 0.0 {
-            // Σ_k T α (1 − α) = Σ_k w (1 − α), w the weight of all streams: here its gradient by w.
-            for (w, g) in chunk.weighted[range.clone()].iter().zip(&mut grad.weight[range.clone()]) {
-                extra += config.entropy * w.total() * w.pass();
-                for g in g {
-                    *g += scale * config.entropy * w.pass();
-                }
-            }
-        }
-        crate::render::composite::backward(
-            &chunk.intervals[range.clone()],
-            &chunk.weighted[range.clone()],
-            ray.left,
-            &grad.weight[range.clone()],
-            d_left,
-            &mut grad.sigma[range.clone()],
-        );
-        let d_transient = scale * config.transient;
-        for k in range {
-            let delta = chunk.intervals[k].delta;
-            let mut direct = 0.0;
-            if config.entropy > 0.0 {
-                // And by 1 − α = e^(−δΣ).
-                let w = &chunk.weighted[k];
-                direct = -scale * config.entropy * w.total() * w.pass() * delta;
-            }
-            for s in 0..3 {
-                let transient = if s > 0 { d_transient * delta } else { 0.0 };
-                grad.samples[s].sigma[k] = grad.sigma[k][s] + direct + transient;
-            }
-            let [_, dynamic, actor] = chunk.intervals[k].sigma;
-            extra += config.transient * delta * (dynamic + actor);
-        }
-        loss.total += f64::from(extra);
     }
     loss
 }
 
-/// Opacity of each stream along a ray.
-fn covers(weighted: &[Weighted]) -> [f32; 3] {
-    let mut cover = [0.0; 3];
-    for w in weighted {
-        for s in 0..3 {
-            cover[s] += w.weight[s];
+/// Finds where things move of the samples of a chunk.
+#[inline(always)]
+fn find_moving(moving: &Volume, chunk: &Chunk, moves: &mut AlignedVec) {
+    let Intervals { layout, t, .. } = &chunk.intervals;
+    moves.zero(layout.len());
+    if moving.is_empty() {
+        return;
+    }
+    for (group, rays) in chunk.rays.chunks(LANES).enumerate() {
+        let [mut origin, mut dir] = [[[0.0; LANES]; 3]; 2];
+        for (n, TracedRay { ray, .. }) in rays.iter().enumerate() {
+            for axis in 0..3 {
+                (origin[axis][n], dir[axis][n]) = (ray.origin[axis], ray.dir[axis]);
+            }
+        }
+        for first in (0..layout.samples).map(|k| layout.number(group * LANES, k)) {
+            let Some(t) = t[first..].first_chunk::<LANES>() else { continue };
+            let mut points = [[0.0; LANES]; 3];
+            for axis in 0..3 {
+                for n in 0..LANES {
+                    points[axis][n] = origin[axis][n] + dir[axis][n] * t[n];
+                }
+            }
+            for (out, moves) in moves[first..].iter_mut().zip(moving.contains(&points)) {
+                *out = f32::from(u8::from(moves));
+            }
         }
     }
-    cover
+}
+
+/// The loss of one vector of rays.
+struct Terms<'a, S: Simd> {
+    simd: S,
+    config: &'a LossConfig,
+    chunk: &'a Chunk,
+    scale: f32,
+    /// Number of the vector.
+    rays: usize,
+    /// What the rays cost beside their colours.
+    cost: Floats<S>,
+}
+
+/// Gradient with respect to what compositing gives rays.
+struct Composited<S: Simd> {
+    /// Three channels and β.
+    values: [Floats<S>; 4],
+    left: Floats<S>,
+}
+
+impl<S: Simd> Terms<'_, S> {
+    /// The numbers of those lanes that are rays.
+    #[inline(always)]
+    fn of_rays(&self, values: Floats<S>) -> impl Iterator<Item = f32> {
+        let mut lanes = [0.0; LANES];
+        ColumnMut::new(self.simd, &mut lanes).set(0, values);
+        lanes.into_iter().take(self.ray_numbers().len())
+    }
+
+    /// Numbers of the rays.
+    #[inline(always)]
+    fn ray_numbers(&self) -> Range<usize> {
+        let (first, all) = (self.rays * S::F32_LANES, self.chunk.intervals.layout.rays);
+        first.min(all)..(first + S::F32_LANES).min(all)
+    }
+
+    /// The loss of the colours, and of how they were exposed: adds it to `loss` and writes the gradient of exposures.
+    #[inline(always)]
+    fn colours(&self, grad: &mut ChunkGradient, loss: &mut ChunkLoss) -> Composited<S> {
+        let Self { simd, config, chunk, scale, rays, .. } = *self;
+        let ChunkGradient { targets, exposure, .. } = grad;
+        let zero = Floats::new(simd, 0.0);
+        let left = Column::new(simd, &chunk.weights.left).at(rays);
+        let beta = Column::new(simd, &chunk.beta).at(rays) + config.beta_min;
+        let precision = 1.0 / (beta * beta);
+        let mut d = Composited { values: [zero; 4], left: zero };
+        let (mut squared, mut exposed, mut d_exposure) = (zero, zero, [zero; 6]);
+        let per_exposure = scale * config.exposure;
+        for c in 0..3 {
+            let [found, aim, background, log_gain, offset] = [
+                &chunk.rgb[c],
+                &targets.rgb[c],
+                &targets.background[c],
+                &targets.exposure[c],
+                &targets.exposure[3 + c],
+            ]
+            .map(|column| Column::new(simd, column).at(rays));
+            let gain = log_gain.exp();
+            let raw = found + left * background;
+            let error = gain * raw + offset - aim;
+            squared += error * error;
+            exposed += log_gain * log_gain + offset * offset;
+            let by_colour = scale * precision * error;
+            d.values[c] = by_colour * gain;
+            d.left += d.values[c] * background;
+            d_exposure[c] = d.values[c] * raw + per_exposure * log_gain;
+            d_exposure[3 + c] = by_colour + per_exposure * offset;
+        }
+        d.values[3] = scale * (1.0 / beta - squared * precision / beta);
+        let fit = 0.5 * squared * precision + (0.5 * config.exposure) * exposed;
+        for ((squared, fit), beta) in self.of_rays(squared).zip(self.of_rays(fit)).zip(self.of_rays(beta)) {
+            loss.squared += f64::from(squared) / 3.0;
+            loss.total += f64::from(fit + beta.ln());
+        }
+        for (c, d) in d_exposure.into_iter().enumerate() {
+            for (exposure, d) in exposure[self.ray_numbers()].iter_mut().zip(self.of_rays(d)) {
+                exposure[c] = d;
+            }
+        }
+        d
+    }
+
+    /// What the weights cost by where they are and how they lie along their rays: writes the gradient with respect to them, front
+    /// to back, to `gradient`, and that with respect to colours and β.
+    #[inline(always)]
+    fn weights(
+        &mut self,
+        composited: &Composited<S>,
+        grad: &mut ChunkGradient,
+        gradient: &mut [[Floats<S>; 3]],
+    ) {
+        let Self { simd, config, chunk, scale, rays, .. } = *self;
+        let Chunk { intervals, weights, samples, .. } = chunk;
+        let [t, delta, pass, moves] = [&intervals.t, &intervals.delta, &weights.pass, &grad.moves]
+            .map(|column| Column::new(simd, column));
+        let weight = weights.weight.each_ref().map(|column| Column::new(simd, column));
+        // Colours and β.
+        let values = samples.each_ref().map(|StreamSamples { rgb: [r, g, b], beta, .. }| {
+            [r, g, b, beta].map(|column| Column::new(simd, column))
+        });
+        let mut d_values = grad.samples.each_mut().map(|StreamSamples { rgb: [r, g, b], beta, .. }| {
+            [r, g, b, beta].map(|column| ColumnMut::new(simd, column))
+        });
+        let [flat, z, depth] = [&grad.disparity, &grad.targets.z, &grad.targets.depth]
+            .map(|column| Column::new(simd, column).at(rays));
+        let flat = flat / z;
+        let [resting, moving] =
+            [false, true].map(|moving| config.prices(moving).map(|price| Floats::new(simd, price)));
+        let along = Along::of(simd, chunk, rays);
+        let (zero, mut cost) = (Floats::new(simd, 0.0), self.cost);
+        // Price of a stream wherever it covers a ray, as things are.
+        let mut veil = [zero; 3];
+        for s in 1..3 {
+            cost += config.veil * along.cover[s] * (1.0 - along.cover[s]);
+            veil[s] = config.veil * (1.0 - 2.0 * along.cover[s]);
+        }
+        let (mut before, mut before_t) = (zero, zero);
+        for (k, gradient) in gradient.iter_mut().enumerate() {
+            let at = k * intervals.layout.vectors::<S>() + rays;
+            let (t, delta, moves) = (t.at(at), delta.at(at), moves.at(at));
+            let w = [weight[0].at(at), weight[1].at(at), weight[2].at(at)];
+            let all = w[0] + w[1] + w[2];
+            // Distortion is half the weights times the gradient of Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i.
+            let (after, after_t) = (along.all - before - all, along.all_t - before_t - all * t);
+            let bent = 2.0 * (t * before - before_t + after_t - t * after) + (2.0 / 3.0) * all * delta;
+            // Σ_k T α (1 − α) = Σ_k w (1 − α), w the weight of all streams: here its gradient by w.
+            let soft = config.entropy * pass.at(at);
+            let depth = config.depth * wrong_depth(simd, t, depth);
+            cost += all * (0.5 * config.distortion * bent + depth + soft);
+            let shared = scale * (config.distortion * bent + depth + soft) + flat * flatness::inverse(t);
+            for s in 0..3 {
+                let price = moving[s].where_greater(moves, zero, resting[s]);
+                cost += price * w[s];
+                let mut g = shared + scale * (price + veil[s]);
+                if let Some(asked) = grad.asked.get(at * S::F32_LANES..(at + 1) * S::F32_LANES) {
+                    let mut of_stream = [0.0; LANES];
+                    of_stream.iter_mut().zip(asked).for_each(|(to, asked)| *to = asked[s]);
+                    g += Column::new(simd, &of_stream).at(0);
+                }
+                if !chunk.batches[s].is_empty() {
+                    // The persistent stream's β is that of all light.
+                    for c in 0..if s > 0 { 4 } else { 3 } {
+                        g += composited.values[c] * values[s][c].at(at);
+                        d_values[s][c].set(at, composited.values[c] * w[s]);
+                    }
+                }
+                gradient[s] = g;
+            }
+            (before, before_t) = (before + all, before_t + all * t);
+        }
+        self.cost = cost;
+    }
+
+    /// What densities cost themselves: adds its gradient to `gradient`, that of weights with respect to them, and writes it where
+    /// streams have a batch.
+    #[inline(always)]
+    fn densities(&mut self, gradient: &[[Floats<S>; 3]], samples: &mut [StreamSamples; 3]) {
+        let Self { simd, config, chunk, scale, rays, .. } = *self;
+        let Chunk { intervals, weights, batches, .. } = chunk;
+        let [delta, pass] = [&intervals.delta, &weights.pass].map(|column| Column::new(simd, column));
+        let weight = weights.weight.each_ref().map(|column| Column::new(simd, column));
+        let sigma = intervals.sigma.each_ref().map(|column| Column::new(simd, column));
+        let mut out = samples.each_mut().map(|s| ColumnMut::new(simd, &mut s.sigma));
+        for (k, gradient) in gradient.iter().enumerate() {
+            let at = k * intervals.layout.vectors::<S>() + rays;
+            let delta = delta.at(at);
+            let all = weight[0].at(at) + weight[1].at(at) + weight[2].at(at);
+            // Of the softness by 1 − α = e^(−δΣ), and of what moves by its optical depth.
+            let soft = (-scale * config.entropy) * all * pass.at(at) * delta;
+            let transient = config.transient * delta;
+            self.cost += transient * (sigma[1].at(at) + sigma[2].at(at));
+            for s in (0..3).filter(|s| !batches[*s].is_empty()) {
+                let direct = if s > 0 { soft + scale * transient } else { soft };
+                out[s].set(at, gradient[s] + direct);
+            }
+        }
+    }
+}
+
+/// Sums over the samples of a vector of rays.
+struct Along<S: Simd> {
+    /// Opacity of each stream.
+    cover: [Floats<S>; 3],
+    /// Σ w, and Σ w t.
+    all: Floats<S>,
+    all_t: Floats<S>,
+}
+
+impl<S: Simd> Along<S> {
+    #[inline(always)]
+    fn of(simd: S, chunk: &Chunk, rays: usize) -> Self {
+        let layout = chunk.intervals.layout;
+        let t = Column::new(simd, &chunk.intervals.t);
+        let weight = chunk.weights.weight.each_ref().map(|column| Column::new(simd, column));
+        let zero = Floats::new(simd, 0.0);
+        let mut along = Self { cover: [zero; 3], all: zero, all_t: zero };
+        for at in (rays..layout.len() / S::F32_LANES).step_by(layout.vectors::<S>()) {
+            let w = [weight[0].at(at), weight[1].at(at), weight[2].at(at)];
+            for s in 0..3 {
+                along.cover[s] += w[s];
+            }
+            along.all += w[0] + w[1] + w[2];
+            along.all_t += (w[0] + w[1] + w[2]) * t.at(at);
+        }
+        along
+    }
 }
 
 /// How wrong it is for a ray to end at `t` where stereo says `depth`, 0 to 1: nothing within its error, and no more
-/// beyond [`FAR_OFF`], so that a false match costs a bounded price.
-fn wrong_depth(t: f32, depth: f32) -> f32 {
-    (((t - depth).abs() / depth - STEREO_ERROR) / (FAR_OFF - STEREO_ERROR)).clamp(0.0, 1.0)
-}
-
-/// Σ_ij w_i w_j |t_i − t_j| + ⅓ Σ w_i² δ_i; adds its gradient with respect to the weights times `scale`, in O(n).
+/// beyond [`FAR_OFF`], so that a false match costs a bounded price; nor where stereo says nothing (0).
 #[inline(always)]
-fn distortion(intervals: &[Interval], weighted: &[Weighted], scale: f32, grad: &mut [[f32; 3]]) -> f32 {
-    let (mut all, mut all_t) = (0.0, 0.0);
-    for (i, w) in intervals.iter().zip(weighted) {
-        all += w.total();
-        all_t += w.total() * i.t;
-    }
-    let (mut before, mut before_t, mut sum) = (0.0, 0.0, 0.0);
-    for ((i, w), g) in intervals.iter().zip(weighted).zip(grad) {
-        let (w, wt) = (w.total(), w.total() * i.t);
-        let (after, after_t) = (all - before - w, all_t - before_t - wt);
-        let d = 2.0 * (i.t * before - before_t + after_t - i.t * after) + (2.0 / 3.0) * w * i.delta;
-        for g in g.iter_mut() {
-            *g += scale * d;
-        }
-        // A quadratic form is half the weights times its gradient.
-        sum += 0.5 * w * d;
-        before += w;
-        before_t += wt;
-    }
-    sum
+fn wrong_depth<S: Simd>(simd: S, t: Floats<S>, depth: Floats<S>) -> Floats<S> {
+    let wrong = ((t - depth).abs() / depth - STEREO_ERROR) * (1.0 / (FAR_OFF - STEREO_ERROR));
+    let nothing = Floats::new(simd, 0.0);
+    wrong.clamp(0.0, 1.0).where_greater(depth, nothing, nothing)
 }

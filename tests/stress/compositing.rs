@@ -1,6 +1,8 @@
 //! Compositing against f64, from nothing to solid and from no sample to a hundred thousand.
 
-use divff::render::composite::{Interval, Weighted, backward, weights};
+use divff::render::composite::{Interval, Intervals, Weights, backward};
+use divff::simd::floats::{ColumnMut, Floats};
+use pulp::{Simd, WithSimd};
 
 use crate::rng::Rng;
 
@@ -10,10 +12,45 @@ const SEEDS: u64 = 120;
 /// Numbers of samples a ray.
 const COUNTS: [usize; 5] = [1, 2, 20, 1000, 100_000];
 
-fn composited(intervals: &[Interval]) -> (Vec<Weighted>, f32) {
-    let mut out = vec![Weighted::default(); intervals.len()];
-    let left = weights(intervals, &mut out);
-    (out, left)
+/// Composites one ray, in the first lane, and goes back from the gradient `g` with respect to its weights and `d_left` with
+/// respect to the light that is left.
+struct OneRay<'a> {
+    intervals: &'a [Interval],
+    g: &'a [[f32; 3]],
+    d_left: f32,
+}
+
+/// Weights, light that is left, and the gradient with respect to σ.
+type Passed = (Vec<[f32; 3]>, f32, Vec<[f32; 3]>);
+
+impl WithSimd for OneRay<'_> {
+    type Output = Passed;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Passed {
+        let Self { intervals, g, d_left } = self;
+        let columns = Intervals::of_ray(intervals);
+        let mut weights = Weights::default();
+        weights.find(simd, &columns);
+        let mut gradient: Vec<_> = g.iter().map(|g| g.map(|g| Floats::new(simd, g))).collect();
+        backward(simd, &columns, &weights, 0, &mut gradient, Floats::new(simd, d_left));
+        let first = |values: Floats<S>| {
+            let mut lanes = [0.0; 16];
+            ColumnMut::new(simd, &mut lanes).set(0, values);
+            lanes[0]
+        };
+        let gradient = gradient.into_iter().map(|g| g.map(first)).collect();
+        (columns.layout.of_ray(0).map(|n| weights.at(n)).collect(), weights.left[0], gradient)
+    }
+}
+
+fn composited(intervals: &[Interval]) -> (Vec<[f32; 3]>, f32) {
+    let (weights, left, _) = pulp::Arch::new().dispatch(OneRay { intervals, g: &[], d_left: 0.0 });
+    (weights, left)
+}
+
+fn gradient_of(intervals: &[Interval], g: &[[f32; 3]], d_left: f32) -> Vec<[f32; 3]> {
+    pulp::Arch::new().dispatch(OneRay { intervals, g, d_left }).2
 }
 
 /// 10 to a power between `low` and `high`.
@@ -24,13 +61,13 @@ fn log_uniform(rng: &mut Rng, low: f32, high: f32) -> f32 {
 #[test]
 fn a_ray_without_samples_keeps_its_light() {
     assert_eq!(composited(&[]).1, 1.0);
-    backward(&[], &[], 1.0, &[], 2.0, &mut []);
+    assert_eq!(gradient_of(&[], &[], 2.0), [[0.0; 3]; 0]);
 }
 
 fn assert_sums_to_one(intervals: &[Interval], what: &str) {
     let (out, left) = composited(intervals);
-    assert!(out.iter().flat_map(|w| w.weight).all(|w| w.is_finite() && w >= 0.0), "{what}");
-    let sum: f64 = out.iter().flat_map(|w| w.weight).map(f64::from).sum::<f64>() + f64::from(left);
+    assert!(out.as_flattened().iter().all(|w| w.is_finite() && *w >= 0.0), "{what}");
+    let sum: f64 = out.as_flattened().iter().copied().map(f64::from).sum::<f64>() + f64::from(left);
     // A rounding for each sample, and the few of an exponential.
     let allowed = (intervals.len() + 2) as f64 * 2f64.powi(-23);
     assert!((sum - 1.0).abs() <= allowed, "{what}: 1 became 1 + {:e}, {allowed:e} are allowed", sum - 1.0);
@@ -73,7 +110,7 @@ fn a_homogeneous_medium_stops_what_beer_and_lambert_say() {
             let delta = 1.0 / n as f32;
             let intervals = vec![Interval { sigma: [sigma, 0.0, 0.0], delta, t: 0.0 }; n];
             let (out, _) = composited(&intervals);
-            let opacity: f64 = out.iter().map(|w| f64::from(w.weight[0])).sum();
+            let opacity: f64 = out.iter().map(|w| f64::from(w[0])).sum();
             let truth = -(-f64::from(sigma) * f64::from(delta) * n as f64).exp_m1();
             let off = (opacity / truth - 1.0).abs();
             assert!(off < 1e-5, "{n} samples, σL = 1e{exponent}: off by {off:e}");
@@ -145,11 +182,10 @@ fn forward_and_backward_are_those_of_f64_for_a_hundred_seeds() {
         let mut number = || 2.0 * rng.uniform() - 1.0;
         let (g, d_left) = ((0..n).map(|_| [0; 3].map(|_| number())).collect::<Vec<_>>(), number());
         let (out, left) = composited(&intervals);
-        let mut gradient = vec![[f32::NAN; 3]; n];
-        backward(&intervals, &out, left, &g, d_left, &mut gradient);
+        let gradient = gradient_of(&intervals, &g, d_left);
         let truth = exact(&intervals, &g, d_left);
         let what = |part: &str| format!("seed {seed}: {part}");
-        assert_close(&out.iter().map(|w| w.weight).collect::<Vec<_>>(), &truth.weights, &what("weights"));
+        assert_close(&out, &truth.weights, &what("weights"));
         assert!((f64::from(left) - truth.left).abs() <= 1e-2 * truth.left + 1e-30, "{}", what("light left"));
         assert_close(&gradient, &truth.gradient, &what("gradient"));
     }

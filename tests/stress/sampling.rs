@@ -2,7 +2,7 @@
 
 use divff::render::density_grid::STRIDE;
 use divff::render::rays::Ray;
-use divff::render::sampler::{Sampler, Sampling, Steer};
+use divff::render::sampler::{RayLanes, Sampler, Sampling, Steer};
 use glam::Vec3;
 
 use crate::SIZES;
@@ -22,9 +22,12 @@ impl Steer for Stretches {
 fn check(sampling: &Sampling, densities: Vec<f32>, jitter: f32) {
     let range = (0.25, 1.25);
     let ray = Ray { origin: Vec3::ZERO, dir: Vec3::X, dir_cam: Vec3::Z, refined_cam: Vec3::Z, range };
-    let mut edges = vec![f32::NAN; sampling.count + 1];
+    let mut rays = RayLanes::default();
+    rays.set(3, &ray);
+    let mut edges = vec![[f32::NAN; STRIDE]; sampling.count + 1];
     let what = format!("{sampling:?}, {densities:?}");
-    assert!(Sampler::default().edges(&ray, sampling, jitter, &Stretches(densities), &mut edges));
+    Sampler::default().edges(&rays, sampling, &[jitter; STRIDE], &Stretches(densities), &mut edges);
+    let edges: Vec<f32> = edges.iter().map(|lanes| lanes[3]).collect();
     assert!(edges.iter().all(|t| t.is_finite()), "{what}: {edges:?}");
     assert!(edges.windows(2).all(|w| w[0] <= w[1]), "{what}: {edges:?}");
     assert!(edges[0] == range.0 && edges[sampling.count] <= range.1 * (1.0 + 1e-6), "{what}: {edges:?}");

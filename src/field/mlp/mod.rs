@@ -169,7 +169,6 @@ impl Mlp {
         a.strip = if all < STRIP { STRIP } else { all.div_ceil(all.div_ceil(STRIP)) };
         let kept = a.strip.min(all).max(a.waiting + 1);
         a.grads.reserve_len((kept * a.stride).max(a.end));
-        a.sums.resize(self.parameters(), 0.0);
     }
 
     /// From the input rows of tile `n` to its output rows.
@@ -228,7 +227,11 @@ impl Mlp {
             Packed::Matrix(packed) => {
                 packed.backward(unit, &self.layers, grad, &mut a.saved, n);
                 if last {
+                    if !a.summed {
+                        a.sums.zero(self.parameters());
+                    }
                     packed.accumulate(unit, &self.layers, &mut a.saved, a.tiles, &mut a.sums);
+                    a.summed = true;
                 }
             }
         }
@@ -239,8 +242,11 @@ impl Mlp {
     fn sum<S: Simd>(&self, simd: S, a: &mut Activations, first: usize) {
         let view = |data| TileView { data, stride: a.stride, offset: 0 };
         let (values, grads) = (view(&a.values[first * a.stride..]), view(&a.grads));
+        if !a.summed {
+            a.sums.zero(BLOCK * self.parameters());
+        }
         vector::accumulate(simd, &self.layers, values, grads, a.waiting, &mut a.sums);
-        a.waiting = 0;
+        (a.waiting, a.summed) = (0, true);
     }
 
     /// Adds the parameter gradients of all tiles that have gone [`Self::backward`] to `out`, in the order of the parameters.
@@ -250,11 +256,11 @@ impl Mlp {
             self.sum(simd, a, 0);
         }
         match packed {
-            _ if a.sums.is_empty() => {}
+            _ if !a.summed => {}
             Packed::Vector(_) => vector::unpack(&self.layers, &a.sums, out),
-            Packed::Matrix(_) => out.iter_mut().zip(&a.sums).for_each(|(out, sum)| *out += sum),
+            Packed::Matrix(_) => out.iter_mut().zip(&*a.sums).for_each(|(out, sum)| *out += sum),
         }
-        a.sums.clear();
+        a.summed = false;
     }
 }
 
@@ -318,8 +324,9 @@ pub struct Activations {
     waiting: usize,
     /// Place of the gradients of the tile that went backward last.
     latest: usize,
-    /// The parameters' gradients, in the order of the arithmetic.
-    sums: Vec<f32>,
+    /// The parameters' gradients, in the order of the arithmetic, and whether there are any.
+    sums: AlignedVec,
+    summed: bool,
     /// Floats of a tile's input and output.
     input: usize,
     output: usize,
@@ -353,7 +360,6 @@ impl Activations {
 
     /// Forgets gradients that nobody has asked for.
     pub fn clear(&mut self) {
-        (self.first, self.waiting) = (0, 0);
-        self.sums.clear();
+        (self.first, self.waiting, self.summed) = (0, 0, false);
     }
 }

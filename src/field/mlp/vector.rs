@@ -6,7 +6,7 @@
 use pulp::Simd;
 
 use super::{BLOCK, Layer};
-use crate::simd::{TILE, row_sums};
+use crate::simd::{TILE, add_quarter_sums};
 
 /// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
 pub struct Packed {
@@ -78,8 +78,12 @@ impl Packed {
     }
 }
 
-/// Adds the parameter gradients of `count` tiles to `sums`: layer by layer the weights' 4 × 4 blocks one after the other, then
-/// the biases.
+/// Four numbers each of four parameters' gradient, which are yet to be summed: number `n` of all sixteen is of parameter `n % 4`.
+type Partial = [f32; BLOCK * BLOCK];
+
+/// Adds the parameter gradients of `count` tiles to `sums`, four numbers a parameter.
+///
+/// Layer by layer, of four outputs after the other the weights input by input, then the biases.
 #[inline(always)]
 pub(super) fn accumulate<S: Simd>(
     simd: S,
@@ -89,39 +93,55 @@ pub(super) fn accumulate<S: Simd>(
     count: usize,
     sums: &mut [f32],
 ) {
+    let (sums, _) = sums.as_chunks_mut();
     for layer in layers {
-        let (weights, biases) = sums[layer.param..].split_at_mut(layer.weights());
-        let mut blocks = weights.as_chunks_mut::<{ BLOCK * BLOCK }>().0.iter_mut();
+        let (weights, biases) = sums[layer.param / BLOCK..].split_at_mut(layer.weights() / BLOCK);
         let x = tiles.rows(layer.row);
         let dy = grads.rows(layer.row + layer.n_in);
-        for o in (0..layer.n_out).step_by(BLOCK) {
-            bias_gradient(simd, dy.rows(o), count, &mut biases[o..o + BLOCK]);
-            for i in (0..layer.n_in).step_by(BLOCK) {
-                let Some(block) = blocks.next() else { break };
-                let product = outer_product(simd, dy.rows(o), x.rows(i), count);
-                for (sum, p) in block.iter_mut().zip(product) {
-                    *sum += p;
+        for (block, (weights, bias)) in weights.chunks_exact_mut(layer.n_in).zip(biases).enumerate() {
+            let dy = dy.rows(block * BLOCK);
+            bias_gradient(simd, dy, count, bias);
+            let mut i = 0;
+            while i < layer.n_in {
+                let wide = inputs_together::<S>(layer.n_in - i);
+                let (x, out) = (x.rows(i), &mut weights[i..i + wide]);
+                match wide {
+                    6 => outer_product::<S, 6>(simd, dy, x, count, out),
+                    4 => outer_product::<S, 4>(simd, dy, x, count, out),
+                    _ => outer_product::<S, 2>(simd, dy, x, count, out),
                 }
+                i += wide;
             }
         }
     }
 }
 
+/// Of the inputs that are left (an even number) those of which sums fit the registers beside each other: the more, the less is loaded
+/// for a product.
+#[inline(always)]
+fn inputs_together<S: Simd>(left: usize) -> usize {
+    match left {
+        _ if S::REGISTER_COUNT < 32 => 2,
+        // Two fours rather than a two at the end.
+        2 | 4 | 8 => left.min(4),
+        _ => 6,
+    }
+}
+
 /// Adds `sums` to `out`, in the order of the parameters.
 pub(super) fn unpack(layers: &[Layer], sums: &[f32], out: &mut [f32]) {
+    let (sums, _) = sums.as_chunks();
+    let all = |partial: &Partial, j: usize| partial[j..].iter().step_by(BLOCK).sum::<f32>();
     for layer in layers {
-        let (weights, biases) = sums[layer.param..].split_at(layer.weights());
+        let (weights, biases) = sums[layer.param / BLOCK..].split_at(layer.weights() / BLOCK);
         let (gw, gb) = out[layer.param..].split_at_mut(layer.weights());
-        let mut blocks = weights.as_chunks::<{ BLOCK * BLOCK }>().0.iter();
-        for o in (0..layer.n_out).step_by(BLOCK) {
-            for (i, block) in (0..layer.n_in).step_by(BLOCK).zip(&mut blocks) {
-                for (j, row) in block.chunks_exact(BLOCK).enumerate() {
-                    let at = (o + j) * layer.n_in + i;
-                    gw[at..at + BLOCK].iter_mut().zip(row).for_each(|(g, v)| *g += v);
-                }
+        let rows = gw.chunks_exact_mut(BLOCK * layer.n_in).zip(gb.chunks_exact_mut(BLOCK));
+        for ((gw, gb), (weights, bias)) in rows.zip(weights.chunks_exact(layer.n_in).zip(biases)) {
+            for (j, (row, gb)) in gw.chunks_exact_mut(layer.n_in).zip(gb).enumerate() {
+                row.iter_mut().zip(weights).for_each(|(g, partial)| *g += all(partial, j));
+                *gb += all(bias, j);
             }
         }
-        gb.iter_mut().zip(&biases[..layer.n_out]).for_each(|(g, v)| *g += v);
     }
 }
 
@@ -143,8 +163,8 @@ impl<'a> TileView<'a> {
     }
 
     #[inline(always)]
-    fn block<S: Simd>(self, tile: usize) -> &'a [S::f32s] {
-        S::as_simd_f32s(&self.data[tile * self.stride + self.offset..][..BLOCK * TILE]).0
+    fn block<S: Simd>(self, tile: usize, rows: usize) -> &'a [S::f32s] {
+        S::as_simd_f32s(&self.data[tile * self.stride + self.offset..][..rows * TILE]).0
     }
 }
 
@@ -208,56 +228,69 @@ fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], f
     }
 }
 
-/// Σ over samples of dy[j] x[k] for a 4 × 4 block.
+/// Adds Σ over samples of dy[j] x[k] to `out`, for four outputs and `WIDE` inputs.
 #[inline(always)]
-fn outer_product<S: Simd>(simd: S, dy: TileView, x: TileView, count: usize) -> [f32; BLOCK * BLOCK] {
+fn outer_product<S: Simd, const WIDE: usize>(
+    simd: S,
+    dy: TileView,
+    x: TileView,
+    count: usize,
+    out: &mut [Partial],
+) {
     let vectors = TILE / S::F32_LANES;
-    let mut acc = [[simd.splat_f32s(0.0); BLOCK]; BLOCK];
+    let mut acc = [[simd.splat_f32s(0.0); BLOCK]; WIDE];
     for tile in 0..count {
-        let dy = dy.block::<S>(tile);
-        let x = x.block::<S>(tile);
+        let dy = dy.block::<S>(tile, BLOCK);
+        let x = x.block::<S>(tile, WIDE);
         for v in 0..vectors {
             let d = [dy[v], dy[vectors + v], dy[2 * vectors + v], dy[3 * vectors + v]];
-            let x = [x[v], x[vectors + v], x[2 * vectors + v], x[3 * vectors + v]];
-            for j in 0..BLOCK {
-                for k in 0..BLOCK {
-                    acc[j][k] = simd.mul_add_e_f32s(d[j], x[k], acc[j][k]);
+            for k in 0..WIDE {
+                let x = x[k * vectors + v];
+                for j in 0..BLOCK {
+                    acc[k][j] = simd.mul_add_e_f32s(d[j], x, acc[k][j]);
                 }
             }
         }
     }
-    if S::F32_LANES == BLOCK * BLOCK {
-        let mut rows = [[0.0; BLOCK * BLOCK]; BLOCK * BLOCK];
-        for j in 0..BLOCK {
-            for k in 0..BLOCK {
-                S::as_mut_simd_f32s(&mut rows[j * BLOCK + k]).0[0] = acc[j][k];
-            }
-        }
-        return row_sums(&rows);
-    }
-    // Plain loops: a closure behind `map` may be compiled without the caller's vector features.
-    let mut sums = [0.0; BLOCK * BLOCK];
-    for j in 0..BLOCK {
-        for k in 0..BLOCK {
-            sums[j * BLOCK + k] = simd.reduce_sum_f32s(acc[j][k]);
-        }
-    }
-    sums
+    add_sums(simd, &acc, out);
 }
 
+/// Adds Σ over samples of dy[j] to `out`.
 #[inline(always)]
-fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut [f32]) {
+fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Partial) {
     let vectors = TILE / S::F32_LANES;
-    let mut acc = [simd.splat_f32s(0.0); BLOCK];
+    // Sums of their own for every third vector, so that none waits for the one before it.
+    let mut acc = [[simd.splat_f32s(0.0); BLOCK]; 3];
     for tile in 0..count {
-        let dy = dy.block::<S>(tile);
-        for (j, a) in acc.iter_mut().enumerate() {
-            for v in 0..vectors {
-                *a = simd.add_f32s(*a, dy[j * vectors + v]);
+        let dy = dy.block::<S>(tile, BLOCK);
+        for v in 0..vectors {
+            for j in 0..BLOCK {
+                acc[v % 3][j] = simd.add_f32s(acc[v % 3][j], dy[j * vectors + v]);
             }
         }
     }
     for j in 0..BLOCK {
-        out[j] += simd.reduce_sum_f32s(acc[j]);
+        acc[0][j] = simd.add_f32s(acc[0][j], simd.add_f32s(acc[1][j], acc[2][j]));
+    }
+    add_sums(simd, &[acc[0]], std::slice::from_mut(out));
+}
+
+/// Adds the lanes of four vectors each to `out`, as far as they are summed there.
+#[inline(always)]
+fn add_sums<S: Simd, const N: usize>(simd: S, vectors: &[[S::f32s; BLOCK]; N], out: &mut [Partial]) {
+    if S::F32_LANES == BLOCK * BLOCK {
+        let mut rows = [[[0.0; BLOCK * BLOCK]; BLOCK]; N];
+        for (rows, vectors) in rows.iter_mut().zip(vectors) {
+            for j in 0..BLOCK {
+                S::as_mut_simd_f32s(&mut rows[j]).0[0] = vectors[j];
+            }
+        }
+        return add_quarter_sums(&rows, out);
+    }
+    // Plain loops: a closure behind `map` may be compiled without the caller's vector features.
+    for (out, vectors) in out.iter_mut().zip(vectors) {
+        for j in 0..BLOCK {
+            out[j] += simd.reduce_sum_f32s(vectors[j]);
+        }
     }
 }

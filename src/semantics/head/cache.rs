@@ -54,12 +54,16 @@ pub(super) struct Found {
 pub(super) fn find(chunk: &Chunk, found: &mut Vec<Vec<Found>>) {
     found.resize_with(chunk.rays.len(), Vec::new);
     found.iter_mut().for_each(Vec::clear);
-    let per_ray = chunk.intervals.len() / chunk.rays.len().max(1);
     for (s, batch) in chunk.batches.iter().enumerate() {
         for (k, place) in batch.points() {
-            let weight = chunk.weighted[k].weight[s];
+            let weight = chunk.weights.weight[s][k];
             if weight > 0.0 {
-                found[k / per_ray].push(Found { weight, stream: s as u8, sample: k as u32, place });
+                found[chunk.intervals.layout.ray(k)].push(Found {
+                    weight,
+                    stream: s as u8,
+                    sample: k as u32,
+                    place,
+                });
             }
         }
     }
@@ -166,10 +170,10 @@ impl WithSimd for TracePass<'_> {
         for inputs in inputs.chunks(CHUNK_RAYS) {
             chunk.densities(simd, &mut tracer, model, views, inputs, sampling);
             find(&chunk, &mut found);
-            for (ray, found) in chunk.rays.iter().zip(&mut found) {
-                out.add(1.0 - ray.left, found, keep);
+            for (r, (ray, found)) in chunk.rays.iter().zip(&mut found).enumerate() {
+                out.add(1.0 - chunk.weights.left[r], found, keep);
                 let light: f32 = found.iter().map(|f| f.weight).sum();
-                let t: f32 = found.iter().map(|f| f.weight * chunk.intervals[f.sample as usize].t).sum();
+                let t: f32 = found.iter().map(|f| f.weight * chunk.intervals.t[f.sample as usize]).sum();
                 out.depth.push(if light > 0.0 { t / light * ray.ray.refined_cam.z } else { 0.0 });
             }
         }

@@ -23,15 +23,17 @@ pub fn prefetch<T>(value: &T, bytes: usize) {
     let _ = (value, bytes);
 }
 
-/// Sum of each row.
+/// Adds the sum of each of four rows to every fourth number of `out`: how it is divided among them depends on the machine.
 #[inline(always)]
-pub fn row_sums(rows: &[[f32; 16]; 16]) -> [f32; 16] {
+pub fn add_quarter_sums(rows: &[[[f32; 16]; 4]], out: &mut [[f32; 16]]) {
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx512f") {
         // SAFETY: this processor has the instructions.
-        return unsafe { lanes::row_sums(rows) };
+        return unsafe { lanes::add_quarter_sums(rows, out) };
     }
-    rows.map(|row| row.iter().sum())
+    for (out, rows) in out.iter_mut().zip(rows) {
+        out.iter_mut().zip(rows).for_each(|(out, row)| *out += row.iter().sum::<f32>());
+    }
 }
 
 /// As [`super::lanes::keep`], from number `first` of those kept on and without the zeros; false, and nothing is done, where there

@@ -5,8 +5,12 @@
 //! less (Heise et al. 2013, "PM-Huber", and the edge-aware terms of self-supervised depth). It carries depth
 //! from the borders of a door or a wall into its middle, where nothing else tells it.
 
+use pulp::Simd;
+
 use super::RayTarget;
 use crate::render::forward::{Chunk, RayInput};
+use crate::simd::AlignedVec;
+use crate::simd::floats::{Column, ColumnMut, Floats};
 
 /// Relative bend up to which the price grows with its square.
 pub const SMALL: f32 = 0.002;
@@ -56,20 +60,20 @@ fn evenness([a, b, c]: [&RayTarget; 3]) -> f32 {
 /// Price of all bends, summed; writes its gradient (times `scale`) with respect to the disparity of each ray.
 ///
 /// The disparity by which a bend is measured is taken as a constant.
-pub fn backward(
+#[inline(always)]
+pub fn backward<S: Simd>(
+    simd: S,
     price: f32,
     chunk: &Chunk,
     bends: &[Bend],
-    count: usize,
     scale: f32,
-    grad: &mut Vec<f32>,
+    grad: &mut AlignedVec,
 ) -> f32 {
-    grad.clear();
-    grad.resize(chunk.rays.len(), 0.0);
+    grad.zero(chunk.intervals.layout.width());
     if price == 0.0 {
         return 0.0;
     }
-    let disparity: Vec<f32> = (0..chunk.rays.len()).map(|r| disparity(chunk, r, count)).collect();
+    let disparity = disparities(simd, chunk);
     let mut sum = 0.0;
     for bend in bends {
         let [a, b, c] = bend.rays.map(|r| disparity[r]);
@@ -86,19 +90,30 @@ pub fn backward(
     sum
 }
 
-/// Expected inverse z-depth of ray `r`, 1/units; what passes the box is at infinity.
-pub fn disparity(chunk: &Chunk, r: usize, count: usize) -> f32 {
-    let range = r * count..(r + 1) * count;
-    let sum = chunk.intervals[range.clone()]
-        .iter()
-        .zip(&chunk.weighted[range])
-        .map(|(i, w)| w.total() * inverse(i.t));
-    sum.sum::<f32>() / chunk.rays[r].ray.refined_cam.z
+/// Expected inverse z-depth of every ray, 1/units; what passes the box is at infinity.
+#[inline(always)]
+pub fn disparities<S: Simd>(simd: S, chunk: &Chunk) -> AlignedVec {
+    let layout = chunk.intervals.layout;
+    let t = Column::new(simd, &chunk.intervals.t);
+    let weight = chunk.weights.weight.each_ref().map(|column| Column::new(simd, column));
+    let mut disparities = AlignedVec::zeros(layout.width());
+    let mut out = ColumnMut::new(simd, &mut disparities);
+    let vectors = layout.vectors::<S>();
+    for rays in 0..vectors {
+        let mut sum = Floats::new(simd, 0.0);
+        for at in (rays..layout.len() / S::F32_LANES).step_by(vectors) {
+            sum += (weight[0].at(at) + weight[1].at(at) + weight[2].at(at)) * inverse(t.at(at));
+        }
+        out.set(rays, sum);
+    }
+    disparities.iter_mut().zip(&chunk.rays).for_each(|(d, ray)| *d /= ray.ray.refined_cam.z);
+    disparities
 }
 
 /// 1/t, bounded: a ray that misses the box has its samples at 0.
-pub fn inverse(t: f32) -> f32 {
-    1.0 / t.max(1e-6)
+#[inline(always)]
+pub fn inverse<S: Simd>(t: Floats<S>) -> Floats<S> {
+    1.0 / t.clamp(1e-6, f32::MAX)
 }
 
 /// What a bend is measured by: the mean disparity of its rays.

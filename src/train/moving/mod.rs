@@ -11,6 +11,7 @@ pub mod masks;
 use glam::{DAffine3, UVec3, Vec3};
 
 use crate::scene::Frame;
+use crate::simd::floor_within;
 use crate::stereo::StereoDepth;
 
 /// Cells of a volume along the longest side of the box; 1.6 cm in a room of 4 m.
@@ -138,11 +139,41 @@ impl Volume {
         self
     }
 
-    /// Whether a point (units) is in one of the cells.
-    #[inline]
-    pub fn contains(&self, p: Vec3) -> bool {
-        self.cell(p)
-            .is_some_and(|c| is_set(&self.blocks, self.block(c)) && is_set(&self.bits, self.number(c)))
+    /// Whether points (units; x, y, z rows) are in one of the cells.
+    #[inline(always)]
+    pub fn contains<const N: usize>(&self, points: &[[f32; N]; 3]) -> [bool; N] {
+        let mut found = [false; N];
+        if self.bits.is_empty() {
+            return found;
+        }
+        let (per_unit, size, blocks) = (1.0 / self.cell, self.size, self.size / BLOCK + 1);
+        let [mut cells, mut in_blocks] = [[0u32; N]; 2];
+        let mut inside = [true; N];
+        for n in 0..N {
+            let [x, y, z] = [points[0][n] * per_unit, points[1][n] * per_unit, points[2][n] * per_unit];
+            inside[n] = (x >= 0.0)
+                & (y >= 0.0)
+                & (z >= 0.0)
+                & (x < size.x as f32)
+                & (y < size.y as f32)
+                & (z < size.z as f32);
+            let (x, _) = floor_within(x, (size.x - 1) as f32);
+            let (y, _) = floor_within(y, (size.y - 1) as f32);
+            let (z, _) = floor_within(z, (size.z - 1) as f32);
+            cells[n] = (z * size.y + y) * size.x + x;
+            in_blocks[n] = (z / BLOCK * blocks.y + y / BLOCK) * blocks.x + x / BLOCK;
+        }
+        for n in 0..N {
+            found[n] = inside[n]
+                && is_set(&self.blocks, in_blocks[n] as usize)
+                && is_set(&self.bits, cells[n] as usize);
+        }
+        found
+    }
+
+    /// Whether there are no cells.
+    pub fn is_empty(&self) -> bool {
+        self.blocks.iter().all(|b| *b == 0)
     }
 
     /// Cells.
@@ -151,24 +182,10 @@ impl Volume {
     }
 
     /// Number of the cell that holds a point.
-    #[inline]
     fn index(&self, p: Vec3) -> Option<usize> {
-        self.cell(p).map(|c| self.number(c))
-    }
-
-    /// The cell that holds a point.
-    #[inline]
-    fn cell(&self, p: Vec3) -> Option<UVec3> {
-        if self.bits.is_empty() || !p.cmpge(Vec3::ZERO).all() {
-            return None;
-        }
-        let c = (p * (1.0 / self.cell)).as_uvec3();
-        c.cmplt(self.size).all().then_some(c)
-    }
-
-    #[inline]
-    fn number(&self, c: UVec3) -> usize {
-        (c.z as usize * self.size.y as usize + c.y as usize) * self.size.x as usize + c.x as usize
+        let (c, size) = ((p * (1.0 / self.cell)).as_uvec3(), self.size);
+        let inside = p.cmpge(Vec3::ZERO).all() && c.cmplt(size).all();
+        inside.then_some((c.z as usize * size.y as usize + c.y as usize) * size.x as usize + c.x as usize)
     }
 
     /// Number of the block that a cell is in.
@@ -194,22 +211,23 @@ mod tests {
         let empty = Volume::new(Vec3::new(1.0, 0.5, 0.25));
         let p = Vec3::new(0.501, 0.25, 0.2);
         let cell = empty.index(p).expect("the point is inside");
-        assert!(!empty.contains(p));
+        let holds = |volume: &Volume, p: Vec3| volume.contains(&p.to_array().map(|x| [x])) == [true];
+        assert!(!holds(&empty, p));
         let says = |moving: Vec<usize>, resting: Vec<usize>| Opinion { moving, resting };
         let frames = |count: usize| (0..count).map(move |_| says(vec![cell, 7, cell], vec![9]));
         let agreeing = usize::from(AGREEING);
-        assert!(!empty.clone().agreed(frames(agreeing - 1)).contains(p), "twice in a frame is once");
+        assert!(!holds(&empty.clone().agreed(frames(agreeing - 1)), p), "twice in a frame is once");
         let volume = empty.clone().agreed(frames(agreeing));
-        assert!(volume.contains(p) && volume.contains(p + 0.001));
-        assert!(!volume.contains(p + 0.01) && volume.len() == 2);
+        assert!(holds(&volume, p) && holds(&volume, p + 0.001));
+        assert!(!holds(&volume, p + 0.01) && volume.len() == 2);
         assert_eq!(empty.clone().agreed(frames(1000)).len(), 2);
         let against = |count: usize| (0..count).map(move |_| says(vec![], vec![cell]));
         let most = (agreeing as f32 * (1.0 / MAJORITY - 1.0)) as usize;
-        assert!(empty.clone().agreed(frames(agreeing).chain(against(most))).contains(p));
-        assert!(!empty.clone().agreed(frames(agreeing).chain(against(most + 1))).contains(p));
+        assert!(holds(&empty.clone().agreed(frames(agreeing).chain(against(most))), p));
+        assert!(!holds(&empty.clone().agreed(frames(agreeing).chain(against(most + 1))), p));
         for outside in [Vec3::splat(-0.1), Vec3::splat(9.0), Vec3::NAN, Vec3::INFINITY] {
-            assert!(!volume.contains(outside), "{outside}");
+            assert!(!holds(&volume, outside), "{outside}");
         }
-        assert!(!Volume::default().contains(p), "nothing moves before that was looked for");
+        assert!(!holds(&Volume::default(), p), "nothing moves before that was looked for");
     }
 }

@@ -215,7 +215,6 @@ impl Traced {
             bends: &self.chunk.bends,
             moving: &self.pixels.moving,
             config: &self.config,
-            count: self.plan.sampling.count,
         })
     }
 
@@ -356,7 +355,7 @@ fn every_gradient_matches_finite_differences() {
     for seed in seeds().take(3) {
         let traced = trace(seed);
         let [p, d, a] = traced.chunk.traced.batches.each_ref().map(|b| b.len());
-        let placed = traced.chunk.traced.intervals.len();
+        let placed = traced.chunk.traced.intervals.layout.len();
         assert!(p < placed && d < placed && a < placed, "some samples must be left out");
         assert!(p.min(d).min(a) > placed / 8, "each stream must be evaluated somewhere");
         check(&traced, seed);
@@ -500,8 +499,9 @@ fn faint_samples_teach_next_to_nothing() {
         assert!(fewer && after.iter().all(|n| *n > 0), "{before:?} → {after:?}");
         let placed = |t: &Traced| t.chunk.traced.cells.each_ref().map(Vec::len);
         assert_eq!((placed(&all), placed(&bright)), (before, before), "densities are looked at everywhere");
-        for (a, b) in all.chunk.traced.weighted.iter().zip(&bright.chunk.traced.weighted) {
-            assert_eq!((a.weight, a.transmittance), (b.weight, b.transmittance));
+        let [a, b] = [&all, &bright].map(|t| &t.chunk.traced.weights);
+        for n in 0..all.chunk.traced.intervals.layout.len() {
+            assert_eq!((a.at(n), a.transmittance[n]), (b.at(n), b.transmittance[n]));
         }
         assert!((all.loss - bright.loss).abs() < 1e-2 * all.loss.abs());
         for (name, place, range) in all.groups() {

@@ -143,7 +143,7 @@ impl Group {
     pub fn tell(&self, s: usize, grid: &mut DensityGrid, rate: f32) {
         for Chunk { cells, intervals, .. } in self.chunks.iter().map(|c| &c.traced) {
             for at in &cells[s] {
-                grid.observe(at.cell as usize, intervals[at.sample as usize].sigma[s], rate);
+                grid.observe(at.cell as usize, intervals.sigma[s][at.sample as usize], rate);
             }
         }
     }
@@ -256,17 +256,16 @@ impl TrainChunk {
         gradient: &mut ChunkGradient,
         number: usize,
     ) -> ChunkLoss {
-        let count = context.plan.sampling.count;
         let faint = Faint { share: context.plan.faint, transient: context.config.transient };
-        self.traced.evaluate(simd, tracer, context.model, count, faint);
+        self.traced.evaluate(simd, tracer, context.model, faint);
         gradient.asked.clear();
         if let Some(companion) = context.companion {
-            gradient.asked.resize(self.traced.intervals.len(), [0.0; 3]);
+            gradient.asked.resize(self.traced.intervals.layout.len(), [0.0; 3]);
             companion.ask(number, &self.traced, &mut gradient.asked);
         }
         let scale = 1.0 / context.rays as f32;
         let aims = Aims { targets: &self.targets, bends: &self.bends, moving: &context.pixels.moving };
-        loss::backward(context.config, &self.traced, &aims, count, scale, gradient)
+        loss::backward(simd, context.config, &self.traced, &aims, scale, gradient)
     }
 
     /// Adds the gradients of all dense weights but those of the networks, which [`finish`] adds, to `dense`, and leaves those
@@ -304,7 +303,7 @@ impl TrainChunk {
                 |ray, sample, g| {
                     let (origin, dir) = &mut rays[ray];
                     *origin += g;
-                    *dir += g * traced.intervals[sample].t;
+                    *dir += g * traced.intervals.t[sample];
                 },
             );
             if let Some(code) = &field.codes[s] {

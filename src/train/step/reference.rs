@@ -12,6 +12,7 @@ use crate::field::hashgrid::{AXES, FEATURES, Lattice};
 use crate::field::mlp::Mlp;
 use crate::field::stream::BETA_MAX;
 use crate::field::{FAST_CHANGE, Field, VIEW};
+use crate::render::composite::RayLayout;
 use crate::render::forward::{Chunk, RayInput};
 use crate::render::rays::View;
 use crate::train::loss::flatness::{self, Bend};
@@ -49,7 +50,6 @@ pub struct Reference<'a> {
     pub bends: &'a [Bend],
     pub moving: &'a Volume,
     pub config: &'a LossConfig,
-    pub count: usize,
 }
 
 #[derive(Clone, Copy, Default)]
@@ -62,7 +62,7 @@ struct Sample {
 impl Reference<'_> {
     /// Mean loss of the rays.
     pub fn loss(&self, x: &Numbers) -> f64 {
-        let mut samples = vec![[Sample::default(); 3]; self.chunk.intervals.len()];
+        let mut samples = vec![[Sample::default(); 3]; self.layout().len()];
         for s in 0..3 {
             for &k in &self.chunk.batches[s].sample {
                 samples[k as usize][s] = self.evaluate(s, k as usize, x);
@@ -72,16 +72,20 @@ impl Reference<'_> {
         let mut sum = 0.0;
         let mut disparity = vec![0.0; rays];
         for r in 0..rays {
-            sum += self.ray_loss(r, &samples[r * self.count..][..self.count], x, &mut disparity[r]);
+            sum += self.ray_loss(r, &samples, x, &mut disparity[r]);
         }
         (sum + self.bend_loss(&disparity)) / rays as f64
     }
 
+    fn layout(&self) -> RayLayout {
+        self.chunk.intervals.layout
+    }
+
     fn bend_loss(&self, disparity: &[f64]) -> f64 {
-        let constant = |r: usize| flatness::disparity(self.chunk, r, self.count);
+        let constant = flatness::disparities(pulp::Scalar::new(), self.chunk);
         let price = |bend: &Bend| {
             let [a, b, c] = bend.rays.map(|r| disparity[r]);
-            let level = flatness::level(bend.rays.map(constant));
+            let level = flatness::level(bend.rays.map(|r| constant[r]));
             let [small, large] = [flatness::SMALL, flatness::LARGE].map(f64::from);
             let size = ((a - 2.0 * b + c) / f64::from(level)).hypot(small);
             f64::from(bend.weight) * (size - small) / (size + large)
@@ -90,16 +94,18 @@ impl Reference<'_> {
     }
 
     fn ray_loss(&self, r: usize, samples: &[[Sample; 3]], x: &Numbers, disparity: &mut f64) -> f64 {
-        let intervals = &self.chunk.intervals[r * self.count..][..self.count];
         let c = self.config;
         let mut light = 1.0;
         let mut weights = Vec::new();
         let (mut rgb, mut beta, mut transient, mut entropy) = ([0.0; 3], f64::from(c.beta_min), 0.0, 0.0);
         let (mut price, mut cover) = (0.0, [0.0; 3]);
-        for (i, sample) in intervals.iter().zip(samples) {
+        for k in self.layout().of_ray(r) {
+            let (i, sample) = (self.chunk.intervals.at(k), &samples[k]);
             let delta = f64::from(i.delta);
             let sum: f64 = sample.iter().map(|s| s.sigma).sum();
-            let prices = c.prices(self.moving.contains(self.chunk.rays[r].ray.at(i.t)));
+            let prices = c.prices(
+                self.moving.contains(&self.chunk.rays[r].ray.at(i.t).to_array().map(|x| [x])) == [true],
+            );
             let alpha = 1.0 - (-sum * delta).exp();
             let mut total = 0.0;
             for (s, sample) in sample.iter().enumerate() {
@@ -153,7 +159,7 @@ impl Reference<'_> {
         let field = self.field;
         let net = field.nets[s].as_ref().expect("only streams that exist are evaluated");
         let ranges = &field.layout.streams[s];
-        let r = k / self.count;
+        let r = self.layout().ray(k);
         let p = self.position(s, k, x);
         let mut input = Vec::new();
         let extent = if s == 2 { DVec3::ONE } else { field.normalisation.extent.as_dvec3() };
@@ -181,9 +187,9 @@ impl Reference<'_> {
     /// World (persistent, dynamic) or frustum (actor) coordinates of sample `k`.
     fn position(&self, s: usize, k: usize, x: &Numbers) -> DVec3 {
         let field = self.field;
-        let r = k / self.count;
+        let r = self.layout().ray(k);
         let input = &self.inputs[r];
-        let t = f64::from(self.chunk.intervals[k].t);
+        let t = f64::from(self.chunk.intervals.t[k]);
         let dir = input.dir_cam.as_dvec3();
         if s == 2 {
             let (near, far) = (0.5 * f64::from(field.near), f64::from(field.actor_far));

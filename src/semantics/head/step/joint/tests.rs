@@ -100,7 +100,7 @@ fn targets(bagged: bool) -> RayTargets {
 
 /// What the features ask of the weights of all samples, and the loss that they say.
 fn asked(heads: &Heads, targets: &RayTargets, traced: &Chunk) -> (Vec<[f32; 3]>, f64) {
-    let mut weight = vec![[0.0; 3]; traced.intervals.len()];
+    let mut weight = vec![[0.0; 3]; traced.intervals.layout.len()];
     let bags = (0..targets.bags.len() as u32).collect();
     let mut group = Group::of(targets.usable.clone(), bags);
     let model = &HeadModel::new(heads, Precision::F32);
@@ -127,7 +127,7 @@ fn features(heads: &Heads, traced: &Chunk) -> Vec<Lit> {
         let mut out = vec![0.0; points.len() * WIDTH];
         model.features(Stream::ALL[s], &points, 0.0, 0.0, &mut out);
         let samples = numbers.iter().zip(out.chunks_exact(WIDTH));
-        lit.extend(samples.map(|(k, f)| (k / SAMPLES, *k, s, f.to_vec())));
+        lit.extend(samples.map(|(k, f)| (traced.intervals.layout.ray(*k), *k, s, f.to_vec())));
     }
     lit
 }
@@ -136,10 +136,10 @@ fn features(heads: &Heads, traced: &Chunk) -> Vec<Lit> {
 fn loss(lit: &[Lit], traced: &Chunk, targets: &RayTargets, (k, s, by): (usize, usize, f64)) -> f64 {
     let mut rendered = vec![[0.0f64; WIDTH + 1]; CHUNK_RAYS];
     let all: Vec<f64> = (0..CHUNK_RAYS)
-        .map(|r| traced.weighted[r * SAMPLES..][..SAMPLES].iter().map(|w| f64::from(w.total())).sum())
+        .map(|r| traced.intervals.layout.of_ray(r).map(|n| f64::from(traced.weights.total(n))).sum())
         .collect();
     for (ray, sample, stream, f) in lit {
-        let mut w = f64::from(traced.weighted[*sample].weight[*stream]);
+        let mut w = f64::from(traced.weights.weight[*stream][*sample]);
         // What is next to nothing is left out.
         if w < 0.005 * all[*ray] || all[*ray] < f64::from(DIM) {
             continue;
