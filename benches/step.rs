@@ -15,7 +15,6 @@ use std::time::Instant;
 
 use divff::config::Config;
 use divff::field::Field;
-use divff::field::encoding::Level;
 use divff::field::hashgrid::Row;
 use divff::field::mlp::{Mlp, Precision};
 use divff::scene::Scene;
@@ -61,12 +60,9 @@ impl Work {
                 self.read_rows += corners * (all + refreshed);
                 self.added_rows += corners * kept;
             }
-            if all > 0.0 {
-                // Values and two moments are read and written; gradients need not leave a near cache.
-                let rows: usize = net.encoding.levels.iter().map(Level::rows).sum();
-                self.bytes += (6 * rows * size_of::<Row>()) as f64;
-            }
         }
+        // Values and two moments are read and written; gradients need not leave a near cache.
+        self.bytes += (6 * report.updated * size_of::<Row>()) as f64;
     }
 
     /// Least seconds for networks, rows, moments and cells.
@@ -168,10 +164,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
 
     let threads = rayon::current_num_threads();
-    let bytes = |looked: &Looked| looked.work.bytes / looked.steps as f64;
-    // Read and written, in bytes.
-    let state = parts.iter().map(|(_, looked)| bytes(looked) / 2.0).fold(0.0, f64::max);
-    let machine = Machine::measure(threads, state as usize);
+    let field = &trainer.trained().field;
+    let rows: usize = field.tables.iter().flatten().map(Vec::len).sum();
+    // Values and two moments.
+    let machine = Machine::measure(threads, 3 * rows * size_of::<Row>());
     let bf16 = match config.train.precision {
         Precision::Auto => matrix::available(),
         precision => precision == Precision::Bf16,

@@ -1,6 +1,6 @@
 //! Adam (Kingma & Ba 2015) over flat weights and over hash-table rows.
 
-use crate::field::hashgrid::Row;
+use crate::field::hashgrid::{FEATURES, Row};
 
 /// Decay rates and the guard against division by zero; instant-ngp's values.
 const BETA1: f32 = 0.9;
@@ -65,21 +65,52 @@ impl TableState {
         Self { first: zeros.clone(), second: zeros }
     }
 
-    /// Updates what has a gradient in this step and clears the gradients.
+    /// Updates what has a gradient in this step and clears the gradients; returns the rows of all cache lines that hold any, and which
+    /// alone are read and written.
     ///
     /// Numbers without a gradient keep their moments: they were not seen, which is no evidence.
     #[inline(always)]
-    pub fn update(&mut self, table: &mut [Row], gradient: &mut [Row], step: StepSize) {
+    pub fn update(&mut self, table: &mut [Row], gradient: &mut [Row], step: StepSize) -> usize {
         let [w, g, m, v] =
             [table, gradient, &mut self.first, &mut self.second].map(bytemuck::cast_slice_mut::<Row, f32>);
-        for (((w, g), m), v) in w.iter_mut().zip(g).zip(m).zip(v) {
-            let (m1, v1) = (*m + (1.0 - BETA1) * (*g - *m), *v + (1.0 - BETA2) * (*g * *g - *v));
-            let w1 = *w - step.rate * m1 / ((v1 * step.correction).sqrt() + EPSILON);
-            let touched = *g != 0.0;
-            *w = if touched { w1 } else { *w };
-            *m = if touched { m1 } else { *m };
-            *v = if touched { v1 } else { *v };
-            *g = 0.0;
+        let (mut at, mut updated) = (0, 0);
+        while at < g.len() {
+            let start = at;
+            while at < g.len() && has_gradient(&g[at..]) {
+                at += LINE;
+            }
+            let end = at.min(g.len());
+            if start < end {
+                let run = start..end;
+                update_seen(&mut w[run.clone()], &mut g[run.clone()], &mut m[run.clone()], &mut v[run], step);
+                updated += end - start;
+            }
+            at += LINE;
         }
+        updated / FEATURES
+    }
+}
+
+/// Numbers of a cache line.
+const LINE: usize = 16;
+
+/// Whether one of the first numbers, as many as a cache line holds, is not zero.
+#[inline(always)]
+fn has_gradient(gradient: &[f32]) -> bool {
+    let Some(line) = gradient.first_chunk::<LINE>() else { return true };
+    line.iter().fold(false, |any, g| any | (*g != 0.0))
+}
+
+/// Updates the numbers that have a gradient and clears the gradients.
+#[inline(always)]
+fn update_seen(w: &mut [f32], g: &mut [f32], m: &mut [f32], v: &mut [f32], step: StepSize) {
+    for (((w, g), m), v) in w.iter_mut().zip(g).zip(m).zip(v) {
+        let (m1, v1) = (*m + (1.0 - BETA1) * (*g - *m), *v + (1.0 - BETA2) * (*g * *g - *v));
+        let w1 = *w - step.rate * m1 / ((v1 * step.correction).sqrt() + EPSILON);
+        let seen = *g != 0.0;
+        *w = if seen { w1 } else { *w };
+        *m = if seen { m1 } else { *m };
+        *v = if seen { v1 } else { *v };
+        *g = 0.0;
     }
 }

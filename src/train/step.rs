@@ -118,6 +118,8 @@ pub struct StepReport {
     pub taken: u64,
     /// Steps through the density grids that rays were spared because nothing was left of their light.
     pub spared: u64,
+    /// Rows of tables that were updated, with those beside them on a cache line.
+    pub updated: usize,
     /// Evaluations from which no pose was to learn, of those from which one would have.
     pub unrefined: usize,
     /// Number of the first chunk of rays whose loss is not finite.
@@ -222,7 +224,7 @@ impl Optimiser {
             let [evaluations, faint] = [report.evaluations, report.faint].map(|n| n.iter().sum::<usize>());
             report.unrefined = (evaluations - faint) / group::REFINE_EVERY as usize;
         }
-        update(self, field, grids, plan);
+        report.updated = update(self, field, grids, plan);
         let ends = [placed, encoded, evaluated, Instant::now()];
         let starts = [start, placed, encoded, evaluated];
         report.seconds = std::array::from_fn(|n| (ends[n] - starts[n]).as_secs_f64());

@@ -16,7 +16,7 @@ pub struct TableScratch {
     around: Around,
 }
 
-/// Scatters one level's gradients, batch after batch, and updates its table.
+/// Scatters one level's gradients, batch after batch, and updates its table; gives the rows that it has updated.
 pub struct TablePass<'a, B> {
     /// Batches that were encoded and gone back through.
     pub batches: B,
@@ -43,10 +43,10 @@ impl<'a, B: Iterator<Item = &'a StreamBatch> + Clone> TablePass<'a, B> {
 }
 
 impl<'a, B: Iterator<Item = &'a StreamBatch>> WithSimd for TablePass<'_, B> {
-    type Output = ();
+    type Output = usize;
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
+    fn with_simd<S: Simd>(self, _simd: S) -> usize {
         let Self { batches, number, level, table, state, rate, scratch } = self;
         let TableScratch { gradient, around } = &mut *scratch.mine();
         if gradient.len() < table.len() {
@@ -56,6 +56,6 @@ impl<'a, B: Iterator<Item = &'a StreamBatch>> WithSimd for TablePass<'_, B> {
         for batch in batches.filter(|b| !b.is_empty()) {
             level.scatter(gradient, batch.tiles(), &batch.levels[number].rows[..batch.len()], around);
         }
-        state.update(table, gradient, rate);
+        state.update(table, gradient, rate)
     }
 }

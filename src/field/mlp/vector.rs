@@ -3,6 +3,7 @@
 //! A tile holds all its layers one after the other: `input | layer 1 | layer 2 | ...`, gradients likewise. Before a layer
 //! that sees the input again, there is a copy of it.
 
+use glam::Vec4;
 use pulp::Simd;
 
 use super::{BLOCK, Layer};
@@ -131,18 +132,24 @@ fn inputs_together<S: Simd>(left: usize) -> usize {
 /// Adds `sums` to `out`, in the order of the parameters.
 pub(super) fn unpack(layers: &[Layer], sums: &[f32], out: &mut [f32]) {
     let (sums, _) = sums.as_chunks();
-    let all = |partial: &Partial, j: usize| partial[j..].iter().step_by(BLOCK).sum::<f32>();
     for layer in layers {
         let (weights, biases) = sums[layer.param / BLOCK..].split_at(layer.weights() / BLOCK);
         let (gw, gb) = out[layer.param..].split_at_mut(layer.weights());
         let rows = gw.chunks_exact_mut(BLOCK * layer.n_in).zip(gb.chunks_exact_mut(BLOCK));
         for ((gw, gb), (weights, bias)) in rows.zip(weights.chunks_exact(layer.n_in).zip(biases)) {
-            for (j, (row, gb)) in gw.chunks_exact_mut(layer.n_in).zip(gb).enumerate() {
-                row.iter_mut().zip(weights).for_each(|(g, partial)| *g += all(partial, j));
-                *gb += all(bias, j);
+            for (i, partial) in weights.iter().enumerate() {
+                for (j, sum) in summed(partial).into_iter().enumerate() {
+                    gw[j * layer.n_in + i] += sum;
+                }
             }
+            gb.iter_mut().zip(summed(bias)).for_each(|(g, sum)| *g += sum);
         }
     }
+}
+
+fn summed(partial: &Partial) -> [f32; BLOCK] {
+    let [a, b, c, d] = [0, 1, 2, 3].map(|n| Vec4::from_slice(&partial[n * BLOCK..]));
+    ((a + b) + (c + d)).to_array()
 }
 
 /// The same rows of many tiles: `data[tile * stride + row * TILE ..]`.

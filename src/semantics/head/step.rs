@@ -215,7 +215,9 @@ impl HeadOptimiser {
             for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)) {
                 let batches = groups.iter().map(move |g| &g.batches[s]);
                 let pass = TablePass { batches, number, level, table, state, rate, scratch };
-                tasks.add(pass.cost(), move || arch.dispatch(pass));
+                tasks.add(pass.cost(), move || {
+                    arch.dispatch(pass);
+                });
             }
         }
         tasks.run();

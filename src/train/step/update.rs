@@ -1,6 +1,7 @@
 //! The end of a step: tables, density grids and dense weights take what the groups have found.
 
 use std::ops::Range;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::{Optimiser, StepPlan};
 use crate::field::Field;
@@ -10,13 +11,13 @@ use crate::tasks::Tasks;
 use crate::train::adam::{self, Moments, StepSize};
 use crate::train::table_pass::TablePass;
 
-/// Updates everything that is learned, and the density grids.
-pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, plan: &StepPlan) {
+/// Updates everything that is learned, and the density grids; returns the rows of tables that were updated.
+pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, plan: &StepPlan) -> usize {
     let Optimiser { dense, tables, groups, gradient, table_scratch: scratch, .. } = optimiser;
     let (groups, scratch) = (&groups[..], &*scratch);
     let arch = pulp::Arch::new();
     let rate = StepSize::new(plan.table_rate, plan.step);
-    let mut tasks = Tasks::default();
+    let (mut tasks, updated) = (Tasks::default(), &AtomicUsize::new(0));
     for (s, (tables, states)) in field.tables.iter_mut().zip(tables).enumerate() {
         let (true, Some(net)) = (plan.streams[s], &field.nets[s]) else { continue };
         let levels = net.encoding.levels.iter().enumerate();
@@ -24,7 +25,9 @@ pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, p
             let chunks = groups.iter().flat_map(|g| &g.chunks);
             let batches = chunks.map(move |chunk| &chunk.traced.batches[s]);
             let pass = TablePass { batches, number, level, table, state, rate, scratch };
-            tasks.add(pass.cost(), move || arch.dispatch(pass));
+            tasks.add(pass.cost(), move || {
+                updated.fetch_add(arch.dispatch(pass), Ordering::Relaxed);
+            });
         }
     }
     for (s, grid) in grids.streams.iter_mut().enumerate().filter(|(s, _)| plan.streams[*s]) {
@@ -43,6 +46,7 @@ pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, p
     });
     tasks.run();
     update_dense(field, dense, gradient, plan);
+    updated.load(Ordering::Relaxed)
 }
 
 fn update_dense(field: &mut Field, moments: &mut Moments, gradient: &[f32], plan: &StepPlan) {
