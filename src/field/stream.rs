@@ -12,6 +12,7 @@ use super::config::Widths;
 use super::encoding::{Encoding, Level};
 use super::hashgrid::{AXES, Around, FEATURES, Points, Row, TIME};
 use super::mlp::{Activations, Mlp, Packed};
+use crate::simd::lanes::{self, Layout};
 use crate::simd::matrix::Unit;
 use crate::simd::{self, AlignedVec, TILE};
 
@@ -179,12 +180,8 @@ impl StreamBatch {
             compact(numbers, kept);
             numbers.truncate(kept.len());
         }
-        // No sample moves towards the end: its new place has been read before.
-        for (to, from) in kept.iter().map(|n| *n as usize).enumerate() {
-            for axis in 0..AXES {
-                pos[to / TILE][axis][to % TILE] = pos[from / TILE][axis][from % TILE];
-            }
-        }
+        let layout = Layout { rows: AXES, stride: AXES * TILE };
+        lanes::keep(pos.as_flattened_mut().as_flattened_mut(), layout, kept);
         pos.truncate(tiles);
         for level in levels {
             if encoded {
