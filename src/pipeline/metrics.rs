@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::eval::Metrics;
+use crate::field::hashgrid::Row;
 use crate::semantics::agreement::Compression;
 use crate::train::checkpoint::TrainingState;
 use crate::work::Work;
@@ -114,15 +115,18 @@ pub fn skipped_in_training(state: &TrainingState, streams: [bool; 3]) -> BTreeMa
 }
 
 /// The work that training saved: at points where the density grids say that a stream has nothing, or where it gives all but
-/// no light (colours, and the way back), for streams that the scene does not have, behind what lets no light through, and
-/// for poses that were exact already.
-pub fn saved_in_training(state: &TrainingState) -> [(&'static str, Work); 5] {
+/// no light (colours, and the way back), for streams that the scene does not have, behind what lets no light through, for poses
+/// that were exact already, and for rows of tables that nobody saw.
+pub fn saved_in_training(state: &TrainingState) -> [(&'static str, Work); 6] {
+    // Values and two moments of a row, read and written.
+    let row = 6 * size_of::<Row>() as u64;
     [
         ("faint_samples", Work::samples(state.faint)),
         ("empty_space", Work::samples(state.candidates.saturating_sub(state.evaluations))),
         ("absent_streams", Work::samples(state.absent)),
         ("saturated_rays", Work::samples(state.spared)),
         ("exact_poses", Work::samples(state.unrefined)),
+        ("unseen_rows", Work::bytes(row * state.unseen)),
     ]
 }
 

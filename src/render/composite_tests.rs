@@ -2,7 +2,7 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::composite::{Interval, Intervals, Weights, backward};
+use super::composite::{Interval, Intervals, RayLayout, Weights, backward};
 use crate::rng::Rng;
 use crate::simd::floats::{ColumnMut, Floats};
 
@@ -160,4 +160,46 @@ fn value(intervals: &[Interval; 3], g: &[[f32; 3]; 3], d_left: f32, (k, s, h): (
         depth += tau;
     }
     sum + f64::from(d_left) * (-depth).exp_m1() // minus the constant d_left
+}
+
+/// Some rays of as many samples together.
+struct Rays<'a>(&'a Intervals);
+
+impl WithSimd for Rays<'_> {
+    type Output = Weights;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Weights {
+        let mut weights = Weights::default();
+        weights.find(simd, self.0);
+        weights
+    }
+}
+
+#[test]
+fn rays_side_by_side_are_as_if_each_were_alone() {
+    let mut rng = Rng::new(5, 0, 0);
+    for rays in [1, 15, 16, 17, 40] {
+        let alone: Vec<Vec<Interval>> = (0..rays)
+            .map(|_| {
+                let sigma = |rng: &mut Rng| [0; 3].map(|_| 20.0 * rng.uniform());
+                (0..7).map(|_| Interval { sigma: sigma(&mut rng), delta: rng.uniform(), t: 0.0 }).collect()
+            })
+            .collect();
+        let mut intervals = Intervals::default();
+        intervals.reset(RayLayout { rays, samples: 7 });
+        let layout = intervals.layout;
+        for (r, ray) in alone.iter().enumerate() {
+            for (n, i) in layout.of_ray(r).zip(ray) {
+                (0..3).for_each(|s| intervals.sigma[s][n] = i.sigma[s]);
+                intervals.delta[n] = i.delta;
+                assert_eq!(layout.ray(n), r);
+            }
+        }
+        let weights = pulp::Arch::new().dispatch(Rays(&intervals));
+        for (r, ray) in alone.iter().enumerate() {
+            let found: Vec<_> = layout.of_ray(r).map(|n| weights.at(n)).collect();
+            assert_eq!((found, weights.left[r]), composited(ray), "ray {r} of {rays}");
+        }
+    }
 }

@@ -159,3 +159,29 @@ fn nothing_that_shows_lies_behind_the_cut() {
     }
     assert!(cut_off > 50, "{cut_off} rays were cut off");
 }
+
+#[test]
+fn rays_side_by_side_are_as_if_each_were_alone() {
+    // Of different lengths, some cut off, one that misses the box.
+    let steer = Along(|t: f32| if t > 1.0 { 80.0 } else { 0.4 * t });
+    let of_lane =
+        |n: usize| (ray(0.1 * n as f32, if n == 3 { 0.0 } else { 0.2 + 0.15 * n as f32 }), 0.06 * n as f32);
+    let (mut rays, mut jitters) = (RayLanes::default(), [0.0; STRIDE]);
+    for n in 0..STRIDE {
+        let (ray, jitter) = of_lane(n);
+        rays.set(n, &ray);
+        jitters[n] = jitter;
+    }
+    let mut together = vec![[f32::NAN; STRIDE]; SAMPLING.count + 1];
+    let mut sampler = Sampler::default();
+    sampler.edges(&rays, &SAMPLING, &jitters, &steer, &mut together);
+    let mut alone = Sampler::default();
+    for n in 0..STRIDE {
+        let (ray, jitter) = of_lane(n);
+        assert_eq!(rays.hits(n), n != 3);
+        let edges = edges_of(&mut alone, &ray, &SAMPLING, jitter, &steer);
+        assert!(edges.iter().eq(together.iter().map(|lanes| &lanes[n])), "lane {n}");
+    }
+    assert_eq!((sampler.taken, sampler.spared), (alone.taken, alone.spared));
+    assert!(sampler.spared > 0);
+}

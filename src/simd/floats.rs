@@ -183,3 +183,55 @@ impl<'a, S: Simd> ColumnMut<'a, S> {
         self.vectors[n] = values.values;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use pulp::WithSimd;
+
+    use super::*;
+
+    /// The functions of all of some numbers, a whole number of the widest vectors.
+    struct All<'a>(&'a [f32]);
+
+    impl WithSimd for All<'_> {
+        type Output = Vec<[f32; 2]>;
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, simd: S) -> Vec<[f32; 2]> {
+            let mut out = [(); 2].map(|()| vec![0.0; self.0.len()]);
+            let x = Column::new(simd, self.0);
+            for n in 0..self.0.len() / S::F32_LANES {
+                let x = x.at(n);
+                let found = [x.exp(), x.abs().one_minus_exp_neg()];
+                for (out, found) in out.iter_mut().zip(found) {
+                    ColumnMut::new(simd, out).set(n, found);
+                }
+            }
+            out[0].iter().zip(&out[1]).map(|(a, b)| [*a, *b]).collect()
+        }
+    }
+
+    #[test]
+    fn every_width_says_the_same() {
+        let extreme = [0.0, -0.0, f32::MAX, f32::MIN, f32::INFINITY, f32::NEG_INFINITY, f32::NAN, 1e-40];
+        let x: Vec<f32> = extreme.into_iter().chain((0..1016).map(|n| 0.2 * (n - 508) as f32)).collect();
+        for (x, found) in x.iter().zip(pulp::Arch::new().dispatch(All(&x))) {
+            let alone = [Floats::one(*x).exp().value(), Floats::one(x.abs()).one_minus_exp_neg().value()];
+            for (a, b) in found.into_iter().zip(alone) {
+                assert!(a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan(), "{x}: {a} and {b}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_no_number_stays_that_and_is_greater_than_nothing() {
+        let [nan, one, two] = [f32::NAN, 1.0, 2.0].map(Floats::one);
+        assert!(nan.clamp(0.0, 1.0).value().is_nan());
+        assert_eq!([-3.0, 0.5, 7.0].map(|x| Floats::one(x).clamp(0.0, 1.0).value()), [0.0, 0.5, 1.0]);
+        for (a, b, chosen) in
+            [(one, two, 2.0), (two, one, 1.0), (nan, one, 2.0), (one, nan, 2.0), (one, one, 2.0)]
+        {
+            assert_eq!(one.where_greater(a, b, two).value(), chosen);
+        }
+    }
+}

@@ -114,3 +114,43 @@ fn update_seen(w: &mut [f32], g: &mut [f32], m: &mut [f32], v: &mut [f32], step:
         *g = 0.0;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::Rng;
+
+    /// Rows that are on a line with others, alone on one, in a run of several lines, and behind the last whole line.
+    const SEEN: [usize; 7] = [5, 6, 40, 44, 47, 48, 102];
+
+    #[test]
+    fn rows_that_nobody_saw_are_as_if_all_had_been_walked() {
+        let mut rng = Rng::new(3, 0, 0);
+        let mut rows = |n| (0..n).map(|_| Row::from_array([0; 4].map(|_| rng.uniform()))).collect::<Vec<_>>();
+        let (mut table, seen) = (rows(103), rows(SEEN.len()));
+        let mut state = TableState { first: rows(103), second: rows(103) };
+        let mut gradient = vec![Row::ZERO; 103];
+        SEEN.into_iter().zip(seen).for_each(|(n, g)| gradient[n] = g);
+        // A number of a row that is seen may be zero.
+        gradient[6].y = 0.0;
+        let (mut all, mut all_table, mut all_gradient) = (state.clone(), table.clone(), gradient.clone());
+        let step = StepSize::new(0.01, 5);
+        let updated = state.update(&mut table, &mut gradient, step);
+        let [w, g, m, v] = [&mut all_table, &mut all_gradient, &mut all.first, &mut all.second]
+            .map(|rows| bytemuck::cast_slice_mut(rows));
+        update_seen(w, g, m, v, step);
+        assert_eq!((&table, &state.first, &state.second), (&all_table, &all.first, &all.second));
+        assert!(gradient.iter().all(|g| *g == Row::ZERO));
+        // Lines 4 to 7, 40 to 51, and what is left behind the last whole one.
+        assert_eq!(updated, 4 + 12 + 3);
+    }
+
+    #[test]
+    fn a_gradient_that_is_no_number_is_not_overlooked() {
+        let mut table = vec![Row::ONE; 8];
+        let mut gradient = vec![Row::ZERO; 8];
+        gradient[5].z = f32::NAN;
+        TableState::new(8).update(&mut table, &mut gradient, StepSize::new(0.01, 1));
+        assert!(table[5].z.is_nan() && table[5].x == 1.0 && table[0] == Row::ONE);
+    }
+}

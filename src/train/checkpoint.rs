@@ -56,6 +56,9 @@ pub struct TrainingState {
     /// Steps through the density grids that rays were spared where nothing was left of their light.
     #[serde(default)]
     pub spared: u64,
+    /// Rows of tables that steps left alone because no ray saw them.
+    #[serde(default)]
+    pub unseen: u64,
     /// Evaluations from which poses would have learned if they had not been exact.
     #[serde(default)]
     pub unrefined: u64,

@@ -120,6 +120,8 @@ pub struct StepReport {
     pub spared: u64,
     /// Rows of tables that were updated, with those beside them on a cache line.
     pub updated: usize,
+    /// All other rows of the streams that took part.
+    pub unseen: usize,
     /// Evaluations from which no pose was to learn, of those from which one would have.
     pub unrefined: usize,
     /// Number of the first chunk of rays whose loss is not finite.
@@ -225,6 +227,8 @@ impl Optimiser {
             report.unrefined = (evaluations - faint) / group::REFINE_EVERY as usize;
         }
         report.updated = update(self, field, grids, plan);
+        let live = field.tables.iter().zip(plan.streams).filter(|(_, live)| *live);
+        report.unseen = live.flat_map(|(tables, _)| tables).map(Vec::len).sum::<usize>() - report.updated;
         let ends = [placed, encoded, evaluated, Instant::now()];
         let starts = [start, placed, encoded, evaluated];
         report.seconds = std::array::from_fn(|n| (ends[n] - starts[n]).as_secs_f64());

@@ -275,6 +275,7 @@ impl Trainer {
         progress.candidates += report.candidates as u64;
         progress.absent += report.absent as u64;
         progress.spared += report.spared;
+        progress.unseen += report.unseen as u64;
         if progress.trusts_poses {
             progress.unrefined += report.unrefined as u64;
         }

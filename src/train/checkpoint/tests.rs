@@ -30,6 +30,7 @@ fn random(seed: u64) -> (Trained, Optimiser) {
         absent: 6,
         spared: 7,
         unrefined: 8,
+        unseen: 9,
         rays: 5,
         streams_settled: true,
         unexplained: Some(0.125),
