@@ -78,7 +78,7 @@ fn on_the_rendered_kitchen() {
         eprintln!("SKIPPED: no kitchen-a in {}; set DIVFF_DATA to run this test", root.display());
         return;
     }
-    let ([right, mirrored], views) = found(&path, &settings(1800));
+    let ([right, mirrored], views) = found(&path, &settings(2600));
     assert!(right >= 0.6, "moved objects are found in {right:.2} of {views} views only");
     assert!(mirrored <= right - 0.2, "at another time as well ({mirrored:.2}): time does not count");
 }
