@@ -8,11 +8,12 @@
 
 use pulp::Simd;
 
+use super::density_grid::STRIDE;
 use crate::simd::AlignedVec;
 use crate::simd::floats::{Column, ColumnMut, Floats};
 
-/// Numbers of rays are padded to a multiple of this, which any vector's lanes divide.
-pub const LANES: usize = 16;
+/// Numbers of rays are padded to a multiple of this, which any vector's lanes divide: to whole groups that are placed together.
+pub const LANES: usize = STRIDE;
 
 /// How the samples of some rays are numbered, each of which has as many.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -63,6 +64,12 @@ impl RayLayout {
     #[inline(always)]
     pub fn vectors<S: Simd>(self) -> usize {
         self.width() / S::F32_LANES
+    }
+
+    /// Numbers of the vectors with the samples of vector `rays` of the rays, front to back.
+    #[inline(always)]
+    pub fn of_vector<S: Simd>(self, rays: usize) -> impl Iterator<Item = usize> {
+        (rays..self.len() / S::F32_LANES).step_by(self.vectors::<S>())
     }
 }
 
@@ -167,10 +174,10 @@ impl Weights {
         let [mut transmittance, mut phis, mut passes, mut left] =
             [&mut self.transmittance, &mut self.phi, &mut self.pass, &mut self.left]
                 .map(|column| ColumnMut::new(simd, column));
-        let (vectors, zero) = (layout.vectors::<S>(), Floats::new(simd, 0.0));
-        for rays in 0..vectors {
+        let zero = Floats::new(simd, 0.0);
+        for rays in 0..layout.vectors::<S>() {
             let mut depth = Sum { sum: zero, rest: zero };
-            for at in (rays..layout.len() / S::F32_LANES).step_by(vectors) {
+            for at in layout.of_vector::<S>(rays) {
                 let delta = delta.at(at);
                 let tau = (sigma[0].at(at) + sigma[1].at(at) + sigma[2].at(at)) * delta;
                 let alpha = tau.one_minus_exp_neg();

@@ -506,11 +506,10 @@ impl Chunk {
 #[inline(always)]
 fn add_weighted<S: Simd>(simd: S, layout: RayLayout, weights: &[f32], values: &[f32], out: &mut [f32]) {
     let [weights, values] = [weights, values].map(|column| Column::new(simd, column));
-    let vectors = layout.vectors::<S>();
     let mut out = ColumnMut::new(simd, out);
-    for rays in 0..vectors {
+    for rays in 0..layout.vectors::<S>() {
         let mut sum = out.at(rays);
-        for at in (rays..layout.len() / S::F32_LANES).step_by(vectors) {
+        for at in layout.of_vector::<S>(rays) {
             sum += weights.at(at) * values.at(at);
         }
         out.set(rays, sum);

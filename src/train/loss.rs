@@ -11,6 +11,7 @@ use self::flatness::Bend;
 use crate::field::stream::StreamSamples;
 use crate::render::composite::{self, Intervals, LANES};
 use crate::render::forward::{Chunk, TracedRay};
+use crate::render::sampler::RayLanes;
 use crate::simd::AlignedVec;
 use crate::simd::floats::{Column, ColumnMut, Floats};
 use crate::train::moving::Volume;
@@ -210,21 +211,11 @@ fn find_moving(moving: &Volume, chunk: &Chunk, moves: &mut AlignedVec) {
         return;
     }
     for (group, rays) in chunk.rays.chunks(LANES).enumerate() {
-        let [mut origin, mut dir] = [[[0.0; LANES]; 3]; 2];
-        for (n, TracedRay { ray, .. }) in rays.iter().enumerate() {
-            for axis in 0..3 {
-                (origin[axis][n], dir[axis][n]) = (ray.origin[axis], ray.dir[axis]);
-            }
-        }
+        let mut lanes = RayLanes::default();
+        rays.iter().enumerate().for_each(|(n, traced)| lanes.set(n, &traced.ray));
         for first in (0..layout.samples).map(|k| layout.number(group * LANES, k)) {
             let Some(t) = t[first..].first_chunk::<LANES>() else { continue };
-            let mut points = [[0.0; LANES]; 3];
-            for axis in 0..3 {
-                for n in 0..LANES {
-                    points[axis][n] = origin[axis][n] + dir[axis][n] * t[n];
-                }
-            }
-            for (out, moves) in moves[first..].iter_mut().zip(moving.contains(&points)) {
+            for (out, moves) in moves[first..].iter_mut().zip(moving.contains(&lanes.points(t))) {
                 *out = f32::from(u8::from(moves));
             }
         }
@@ -426,7 +417,7 @@ impl<S: Simd> Along<S> {
         let weight = chunk.weights.weight.each_ref().map(|column| Column::new(simd, column));
         let zero = Floats::new(simd, 0.0);
         let mut along = Self { cover: [zero; 3], all: zero, all_t: zero };
-        for at in (rays..layout.len() / S::F32_LANES).step_by(layout.vectors::<S>()) {
+        for at in layout.of_vector::<S>(rays) {
             let w = [weight[0].at(at), weight[1].at(at), weight[2].at(at)];
             for s in 0..3 {
                 along.cover[s] += w[s];

@@ -1,57 +1,19 @@
 //! Compositing against f64, from nothing to solid and from no sample to a hundred thousand.
 
-use divff::render::composite::{Interval, Intervals, Weights, backward};
+use divff::render::composite::{Interval, Intervals, LANES, Weights, backward};
 use divff::simd::floats::{ColumnMut, Floats};
-use pulp::{Simd, WithSimd};
 
 use crate::rng::Rng;
+
+#[path = "../../src/render/one_ray.rs"]
+mod one_ray;
+use one_ray::{composited, gradient_of};
 
 /// Seeds of the comparisons with f64.
 const SEEDS: u64 = 120;
 
 /// Numbers of samples a ray.
 const COUNTS: [usize; 5] = [1, 2, 20, 1000, 100_000];
-
-/// Composites one ray, in the first lane, and goes back from the gradient `g` with respect to its weights and `d_left` with
-/// respect to the light that is left.
-struct OneRay<'a> {
-    intervals: &'a [Interval],
-    g: &'a [[f32; 3]],
-    d_left: f32,
-}
-
-/// Weights, light that is left, and the gradient with respect to σ.
-type Passed = (Vec<[f32; 3]>, f32, Vec<[f32; 3]>);
-
-impl WithSimd for OneRay<'_> {
-    type Output = Passed;
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) -> Passed {
-        let Self { intervals, g, d_left } = self;
-        let columns = Intervals::of_ray(intervals);
-        let mut weights = Weights::default();
-        weights.find(simd, &columns);
-        let mut gradient: Vec<_> = g.iter().map(|g| g.map(|g| Floats::new(simd, g))).collect();
-        backward(simd, &columns, &weights, 0, &mut gradient, Floats::new(simd, d_left));
-        let first = |values: Floats<S>| {
-            let mut lanes = [0.0; 16];
-            ColumnMut::new(simd, &mut lanes).set(0, values);
-            lanes[0]
-        };
-        let gradient = gradient.into_iter().map(|g| g.map(first)).collect();
-        (columns.layout.of_ray(0).map(|n| weights.at(n)).collect(), weights.left[0], gradient)
-    }
-}
-
-fn composited(intervals: &[Interval]) -> (Vec<[f32; 3]>, f32) {
-    let (weights, left, _) = pulp::Arch::new().dispatch(OneRay { intervals, g: &[], d_left: 0.0 });
-    (weights, left)
-}
-
-fn gradient_of(intervals: &[Interval], g: &[[f32; 3]], d_left: f32) -> Vec<[f32; 3]> {
-    pulp::Arch::new().dispatch(OneRay { intervals, g, d_left }).2
-}
 
 /// 10 to a power between `low` and `high`.
 fn log_uniform(rng: &mut Rng, low: f32, high: f32) -> f32 {

@@ -98,10 +98,9 @@ pub fn disparities<S: Simd>(simd: S, chunk: &Chunk) -> AlignedVec {
     let weight = chunk.weights.weight.each_ref().map(|column| Column::new(simd, column));
     let mut disparities = AlignedVec::zeros(layout.width());
     let mut out = ColumnMut::new(simd, &mut disparities);
-    let vectors = layout.vectors::<S>();
-    for rays in 0..vectors {
+    for rays in 0..layout.vectors::<S>() {
         let mut sum = Floats::new(simd, 0.0);
-        for at in (rays..layout.len() / S::F32_LANES).step_by(vectors) {
+        for at in layout.of_vector::<S>(rays) {
             sum += (weight[0].at(at) + weight[1].at(at) + weight[2].at(at)) * inverse(t.at(at));
         }
         out.set(rays, sum);
