@@ -66,7 +66,7 @@ impl WithSimd for Pass<'_> {
             values.extend_from_slice(a.output(n));
         }
         let mut gradients = Vec::new();
-        net.reserve_backward(TILES, &mut a);
+        net.reserve_backward::<S>(TILES, &mut a);
         for n in 0..TILES {
             a.output_grad().copy_from_slice(&grads[n * rows + output..(n + 1) * rows]);
             net.backward(simd, &unit, &packed, &mut a, n);
@@ -250,7 +250,7 @@ impl WithSimd for Chunks<'_> {
                 a.input(n).copy_from_slice(&tiles[n % TILES * rows..][..input]);
                 net.forward(simd, &unit, &packed, &mut a, n);
             }
-            net.reserve_backward(count, &mut a);
+            net.reserve_backward::<S>(count, &mut a);
             for n in 0..count {
                 a.output_grad().copy_from_slice(&grads[n % TILES * rows + output..][..rows - output]);
                 net.backward(simd, &unit, &packed, &mut a, n);

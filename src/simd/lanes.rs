@@ -53,16 +53,19 @@ mod tests {
 
     #[test]
     fn every_row_has_its_sum() {
-        // Whole numbers, which no order of summing rounds.
-        let rows: [[[f32; 16]; 4]; 3] = std::array::from_fn(|n| {
-            std::array::from_fn(|j| std::array::from_fn(|k| (100 * n + j * j + 3 * k) as f32))
-        });
-        let mut out = [[1.0; 16]; 3];
-        add_quarter_sums(&rows, &mut out);
-        for (n, out) in out.iter().enumerate() {
-            for j in 0..4 {
-                let sum: f32 = out[j..].iter().step_by(4).sum();
-                assert_eq!(sum, (4 + 16 * (100 * n + j * j) + 360) as f32);
+        for lanes in [16, 8, 4, 1] {
+            // Whole numbers, which no order of summing rounds.
+            let value = |n: usize, j: usize, k: usize| (100 * n + j * j + 3 * k) as f32;
+            let rows: Vec<f32> =
+                (0..12 * lanes).map(|at| value(at / lanes / 4, at / lanes % 4, at % lanes)).collect();
+            let mut out = [[1.0; 16]; 3];
+            add_quarter_sums(&rows, lanes, &mut out);
+            for (n, out) in out.iter().enumerate() {
+                for j in 0..4 {
+                    let sum: f32 = out[j..].iter().step_by(4).sum();
+                    let truth: f32 = (0..lanes).map(|k| value(n, j, k)).sum();
+                    assert_eq!(sum, 4.0 + truth, "{lanes} lanes");
+                }
             }
         }
     }

@@ -11,6 +11,7 @@ use pulp::Simd;
 use serde::{Deserialize, Serialize};
 
 use self::vector::TileView;
+use crate::simd::floats::{ColumnMut, Floats};
 use crate::simd::lanes::{self, Layout};
 use crate::simd::matrix::{Unit, available};
 use crate::simd::{AlignedVec, TILE};
@@ -27,7 +28,12 @@ const LEAST_GRADIENT: f32 = 1e-18;
 
 /// Most tiles whose gradients are kept until those of the weights are summed: with what was evaluated there, they stay near
 /// the core, and a sum over fewer would not be worth its end.
-const STRIP: usize = 18;
+#[inline(always)]
+fn strip<S: Simd>() -> usize {
+    // Six inputs and four outputs of as many tiles fit a nearest cache of 32 KiB, which processors with few registers have, or one of
+    // 48 KiB.
+    if S::REGISTER_COUNT < 32 { 9 } else { 18 }
+}
 
 /// What the networks are multiplied in. Weights, sums, gradients and everything else are f32 in any case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -162,11 +168,12 @@ impl Mlp {
     }
 
     /// Makes room for the way back through the first `tiles` of the evaluated tiles.
-    pub fn reserve_backward(&self, tiles: usize, a: &mut Activations) {
+    pub fn reserve_backward<S: Simd>(&self, tiles: usize, a: &mut Activations) {
         a.tiles = tiles;
         // As many in every strip, since the sums at the end of one take time.
         let all = a.waiting + tiles;
-        a.strip = if all < STRIP { STRIP } else { all.div_ceil(all.div_ceil(STRIP)) };
+        let strip = strip::<S>();
+        a.strip = if all < strip { strip } else { all.div_ceil(all.div_ceil(strip)) };
         let kept = a.strip.min(all).max(a.waiting + 1);
         a.grads.reserve_len((kept * a.stride).max(a.end));
     }
@@ -211,8 +218,11 @@ impl Mlp {
         let last = n + 1 == a.tiles;
         a.latest = a.waiting;
         let grad = &mut a.grads[a.waiting * a.stride..][..a.end];
-        for g in &mut grad[a.end - a.output..] {
-            *g = if g.abs() < LEAST_GRADIENT { 0.0 } else { *g };
+        let mut output = ColumnMut::new(simd, &mut grad[a.end - a.output..]);
+        let (none, least) = (Floats::new(simd, 0.0), Floats::new(simd, LEAST_GRADIENT));
+        for v in 0..a.output / S::F32_LANES {
+            let g = output.at(v);
+            output.set(v, none.where_greater(least, g.abs(), g));
         }
         match packed {
             Packed::Vector(packed) => {

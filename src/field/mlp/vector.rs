@@ -99,20 +99,23 @@ pub(super) fn accumulate<S: Simd>(
         let (weights, biases) = sums[layer.param / BLOCK..].split_at_mut(layer.weights() / BLOCK);
         let x = tiles.rows(layer.row);
         let dy = grads.rows(layer.row + layer.n_in);
-        for (block, (weights, bias)) in weights.chunks_exact_mut(layer.n_in).zip(biases).enumerate() {
-            let dy = dy.rows(block * BLOCK);
-            bias_gradient(simd, dy, count, bias);
-            let mut i = 0;
-            while i < layer.n_in {
-                let wide = inputs_together::<S>(layer.n_in - i);
-                let (x, out) = (x.rows(i), &mut weights[i..i + wide]);
+        for (block, bias) in biases[..layer.n_out / BLOCK].iter_mut().enumerate() {
+            bias_gradient(simd, dy.rows(block * BLOCK), count, bias);
+        }
+        // The inputs, of which there are more at a time than outputs, stay in the nearest cache while all outputs pass.
+        let mut i = 0;
+        while i < layer.n_in {
+            let wide = inputs_together(layer.n_in - i);
+            let x = x.rows(i);
+            for (block, weights) in weights.chunks_exact_mut(layer.n_in).enumerate() {
+                let (dy, out) = (dy.rows(block * BLOCK), &mut weights[i..i + wide]);
                 match wide {
                     6 => outer_product::<S, 6>(simd, dy, x, count, out),
                     4 => outer_product::<S, 4>(simd, dy, x, count, out),
                     _ => outer_product::<S, 2>(simd, dy, x, count, out),
                 }
-                i += wide;
             }
+            i += wide;
         }
     }
 }
@@ -120,9 +123,8 @@ pub(super) fn accumulate<S: Simd>(
 /// Of the inputs that are left (an even number) those of which sums fit the registers beside each other: the more, the less is loaded
 /// for a product.
 #[inline(always)]
-fn inputs_together<S: Simd>(left: usize) -> usize {
+fn inputs_together(left: usize) -> usize {
     match left {
-        _ if S::REGISTER_COUNT < 32 => 2,
         // Two fours rather than a two at the end.
         2 | 4 | 8 => left.min(4),
         _ => 6,
@@ -189,53 +191,98 @@ enum Finish<'a, V> {
 /// y = W x + b for one tile, finished; `w` is packed four outputs side by side.
 #[inline(always)]
 fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], finish: Finish<S::f32s>) {
-    let vectors = TILE / S::F32_LANES;
+    match S::REGISTER_COUNT {
+        ..32 => matmul_of::<S, 2>(simd, w, bias, x, y, finish),
+        _ => matmul_of::<S, 3>(simd, w, bias, x, y, finish),
+    }
+}
+
+/// [`matmul`], `WIDE` vectors side by side.
+#[inline(always)]
+fn matmul_of<S: Simd, const WIDE: usize>(
+    simd: S,
+    w: &[f32],
+    bias: &[f32],
+    x: &[f32],
+    y: &mut [f32],
+    finish: Finish<S::f32s>,
+) {
+    let groups = TILE / S::F32_LANES / WIDE;
     let n_in = x.len() / TILE;
-    let x = S::as_simd_f32s(x).0;
-    let y = S::as_mut_simd_f32s(y).0;
-    let threes = x.as_chunks::<3>().0;
+    let x = S::as_simd_f32s(x).0.as_chunks::<WIDE>().0;
+    let y = S::as_mut_simd_f32s(y).0.as_chunks_mut::<WIDE>().0;
     let zero = simd.splat_f32s(0.0);
-    for group in (0..vectors).step_by(3) {
+    for group in 0..groups {
         for (block, w) in w.chunks_exact(BLOCK * n_in).enumerate() {
-            let mut acc = [[zero; 3]; BLOCK];
+            let mut acc = [[zero; WIDE]; BLOCK];
             if let Some(b) = bias.get(block * BLOCK..(block + 1) * BLOCK) {
-                for (a, b) in acc.iter_mut().zip(b) {
-                    *a = [simd.splat_f32s(*b); 3];
-                }
-            }
-            let w = w.as_chunks::<BLOCK>().0;
-            for (k, w) in w.iter().enumerate() {
-                let x = &threes[(k * vectors + group) / 3];
                 for j in 0..BLOCK {
-                    let w = simd.splat_f32s(w[j]);
-                    for v in 0..3 {
-                        acc[j][v] = simd.mul_add_e_f32s(w, x[v], acc[j][v]);
-                    }
+                    acc[j] = [simd.splat_f32s(b[j]); WIDE];
                 }
             }
-            for (j, a) in acc.iter().enumerate() {
-                let at = (block * BLOCK + j) * vectors + group;
-                let Some(out) = y[at..].first_chunk_mut::<3>() else { continue };
-                match finish {
-                    Finish::Plain => *out = *a,
-                    Finish::Relu => {
-                        for v in 0..3 {
-                            out[v] = simd.max_f32s(a[v], zero);
+            // Four inputs at a time, since counting takes instructions, too; and without iterators, of which the compiler may
+            // leave calls, for which all sums would go through memory.
+            let mut rest = &x[group..];
+            for w in w.as_chunks::<{ BLOCK * BLOCK }>().0 {
+                let x = &rest[..3 * groups + 1];
+                for k in 0..BLOCK {
+                    let x = &x[k * groups];
+                    for j in 0..BLOCK {
+                        let w = simd.splat_f32s(w[k * BLOCK + j]);
+                        for v in 0..WIDE {
+                            acc[j][v] = simd.mul_add_e_f32s(w, x[v], acc[j][v]);
                         }
                     }
-                    Finish::Where(x) => {
-                        let x = &x[at..][..3];
-                        for v in 0..3 {
-                            out[v] = simd.select_f32s(simd.greater_than_f32s(x[v], zero), a[v], zero);
-                        }
-                    }
+                }
+                rest = rest.get(BLOCK * groups..).unwrap_or_default();
+            }
+            let at = block * BLOCK * groups + group;
+            finish_rows(simd, &acc, finish, at, groups, y);
+        }
+    }
+}
+
+/// Writes the sums of four rows, finished: `out[at]` and the three that follow it every `stride` are theirs.
+///
+/// One short loop for each way to finish: the compiler unrolls them, and so keeps the sums in registers.
+#[inline(always)]
+fn finish_rows<S: Simd, const WIDE: usize>(
+    simd: S,
+    sums: &[[S::f32s; WIDE]; BLOCK],
+    finish: Finish<S::f32s>,
+    at: usize,
+    stride: usize,
+    out: &mut [[S::f32s; WIDE]],
+) {
+    let out = &mut out[at..][..3 * stride + 1];
+    let zero = simd.splat_f32s(0.0);
+    match finish {
+        Finish::Plain => {
+            for j in 0..BLOCK {
+                out[j * stride] = sums[j];
+            }
+        }
+        Finish::Relu => {
+            for j in 0..BLOCK {
+                for v in 0..WIDE {
+                    out[j * stride][v] = simd.max_f32s(sums[j][v], zero);
+                }
+            }
+        }
+        Finish::Where(x) => {
+            let x = &x.as_chunks::<WIDE>().0[at..][..3 * stride + 1];
+            for j in 0..BLOCK {
+                for v in 0..WIDE {
+                    let positive = simd.greater_than_f32s(x[j * stride][v], zero);
+                    out[j * stride][v] = simd.select_f32s(positive, sums[j][v], zero);
                 }
             }
         }
     }
 }
 
-/// Adds Σ over samples of dy[j] x[k] to `out`, for four outputs and `WIDE` inputs.
+/// Adds Σ over samples of dy[j] x[k] to `out`, for four outputs and `WIDE` inputs: for half of the outputs at a time where registers
+/// are few.
 #[inline(always)]
 fn outer_product<S: Simd, const WIDE: usize>(
     simd: S,
@@ -244,22 +291,49 @@ fn outer_product<S: Simd, const WIDE: usize>(
     count: usize,
     out: &mut [Partial],
 ) {
+    if S::REGISTER_COUNT < 32 {
+        let (first, second) = (
+            outputs_by_inputs::<S, 2, WIDE>(simd, dy, x, count),
+            outputs_by_inputs::<S, 2, WIDE>(simd, dy.rows(2), x, count),
+        );
+        let mut acc = [[simd.splat_f32s(0.0); BLOCK]; WIDE];
+        for k in 0..WIDE {
+            acc[k] = [first[k][0], first[k][1], second[k][0], second[k][1]];
+        }
+        add_sums::<S, _>(&acc, out);
+    } else {
+        let sums = outputs_by_inputs::<S, BLOCK, WIDE>(simd, dy, x, count);
+        add_sums::<S, _>(&sums, out);
+    }
+}
+
+/// Σ over samples of dy[j] x[k], `[k][j]`, but for the sum over lanes.
+#[inline(always)]
+fn outputs_by_inputs<S: Simd, const OUTPUTS: usize, const INPUTS: usize>(
+    simd: S,
+    dy: TileView,
+    x: TileView,
+    count: usize,
+) -> [[S::f32s; OUTPUTS]; INPUTS] {
     let vectors = TILE / S::F32_LANES;
-    let mut acc = [[simd.splat_f32s(0.0); BLOCK]; WIDE];
+    let mut acc = [[simd.splat_f32s(0.0); OUTPUTS]; INPUTS];
     for tile in 0..count {
-        let dy = dy.block::<S>(tile, BLOCK);
-        let x = x.block::<S>(tile, WIDE);
+        let dy = dy.block::<S>(tile, OUTPUTS);
+        let x = x.block::<S>(tile, INPUTS);
         for v in 0..vectors {
-            let d = [dy[v], dy[vectors + v], dy[2 * vectors + v], dy[3 * vectors + v]];
-            for k in 0..WIDE {
+            let mut d = [dy[v]; OUTPUTS];
+            for j in 1..OUTPUTS {
+                d[j] = dy[j * vectors + v];
+            }
+            for k in 0..INPUTS {
                 let x = x[k * vectors + v];
-                for j in 0..BLOCK {
+                for j in 0..OUTPUTS {
                     acc[k][j] = simd.mul_add_e_f32s(d[j], x, acc[k][j]);
                 }
             }
         }
     }
-    add_sums(simd, &acc, out);
+    acc
 }
 
 /// Adds Σ over samples of dy[j] to `out`.
@@ -279,25 +353,11 @@ fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Partial
     for j in 0..BLOCK {
         acc[0][j] = simd.add_f32s(acc[0][j], simd.add_f32s(acc[1][j], acc[2][j]));
     }
-    add_sums(simd, &[acc[0]], std::slice::from_mut(out));
+    add_sums::<S, _>(&[acc[0]], std::slice::from_mut(out));
 }
 
 /// Adds the lanes of four vectors each to `out`, as far as they are summed there.
 #[inline(always)]
-fn add_sums<S: Simd, const N: usize>(simd: S, vectors: &[[S::f32s; BLOCK]; N], out: &mut [Partial]) {
-    if S::F32_LANES == BLOCK * BLOCK {
-        let mut rows = [[[0.0; BLOCK * BLOCK]; BLOCK]; N];
-        for (rows, vectors) in rows.iter_mut().zip(vectors) {
-            for j in 0..BLOCK {
-                S::as_mut_simd_f32s(&mut rows[j]).0[0] = vectors[j];
-            }
-        }
-        return add_quarter_sums(&rows, out);
-    }
-    // Plain loops: a closure behind `map` may be compiled without the caller's vector features.
-    for (out, vectors) in out.iter_mut().zip(vectors) {
-        for j in 0..BLOCK {
-            out[j] += simd.reduce_sum_f32s(vectors[j]);
-        }
-    }
+fn add_sums<S: Simd, const N: usize>(vectors: &[[S::f32s; BLOCK]; N], out: &mut [Partial]) {
+    add_quarter_sums(bytemuck::cast_slice(vectors.as_flattened()), S::F32_LANES, out);
 }

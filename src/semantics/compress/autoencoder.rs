@@ -244,8 +244,8 @@ impl WithSimd for TrainTile<'_> {
         back.input(0).copy_from_slice(code.output(0));
         decoder.forward(simd, &unit, pack_decoder, &mut back, 0);
         let output = back.output(0).to_vec();
-        decoder.reserve_backward(1, &mut back);
-        encoder.reserve_backward(1, &mut code);
+        decoder.reserve_backward::<S>(1, &mut back);
+        encoder.reserve_backward::<S>(1, &mut code);
         let grad = back.output_grad();
         grad.fill(0.0);
         loss_gradient(self.rows, &self.picked, full, &output, grad);

@@ -398,7 +398,7 @@ impl Group {
             let Some((net, packed)) = model.net(s).filter(|_| !batch.is_empty()) else { continue };
             let StreamBatch { sample, levels, .. } = batch;
             let activations = &mut activations[s];
-            net.mlp.reserve_backward(sample.len().div_ceil(TILE), activations);
+            net.mlp.reserve_backward::<S>(sample.len().div_ceil(TILE), activations);
             for (n, (rays, shares)) in sample.chunks(TILE).zip(shares[s].chunks(TILE)).enumerate() {
                 let out = activations.output_grad();
                 out.fill(0.0);

@@ -23,16 +23,20 @@ pub fn prefetch<T>(value: &T, bytes: usize) {
     let _ = (value, bytes);
 }
 
-/// Adds the sum of each of four rows to every fourth number of `out`: how it is divided among them depends on the machine.
+/// Adds the sum of each of four rows of `lanes` numbers to every fourth number of `out`, and so on for the next four: how it is
+/// divided among them depends on the machine.
 #[inline(always)]
-pub fn add_quarter_sums(rows: &[[[f32; 16]; 4]], out: &mut [[f32; 16]]) {
+pub fn add_quarter_sums(rows: &[f32], lanes: usize, out: &mut [[f32; 16]]) {
     #[cfg(target_arch = "x86_64")]
-    if is_x86_feature_detected!("avx512f") {
+    match lanes {
         // SAFETY: this processor has the instructions.
-        return unsafe { lanes::add_quarter_sums(rows, out) };
+        16 if is_x86_feature_detected!("avx512f") => return unsafe { lanes::add_quarter_sums(rows, out) },
+        // SAFETY: likewise.
+        8 if is_x86_feature_detected!("avx") => return unsafe { lanes::add_half_sums(rows, out) },
+        _ => {}
     }
-    for (out, rows) in out.iter_mut().zip(rows) {
-        out.iter_mut().zip(rows).for_each(|(out, row)| *out += row.iter().sum::<f32>());
+    for (out, rows) in out.iter_mut().zip(rows.chunks_exact(4 * lanes)) {
+        out.iter_mut().zip(rows.chunks_exact(lanes)).for_each(|(out, row)| *out += row.iter().sum::<f32>());
     }
 }
 
@@ -44,6 +48,10 @@ pub fn keep_lanes(values: &mut [f32], layout: Layout, kept: &[u32], first: usize
     if is_x86_feature_detected!("avx512f") {
         // SAFETY: this processor has the instructions.
         unsafe { lanes::keep(values, layout, kept, first) };
+        return true;
+    } else if is_x86_feature_detected!("avx2") {
+        // SAFETY: likewise.
+        unsafe { lanes::keep_eights(values, layout, kept, first) };
         return true;
     }
     #[cfg(not(target_arch = "x86_64"))]
