@@ -242,6 +242,30 @@ impl Lattice {
                 frac[axis][s] = (q - c).clamp(0.0, 1.0);
             }
         }
+        // Which of the two is asked here and not for each point: what a vector does or not by a mask is slow on many processors.
+        if self.dense {
+            self.dense_rows(&cell, layer, rows);
+        } else {
+            self.hashed_rows(&cell, layer, rows);
+        }
+    }
+
+    /// Rows around cells of a lattice that has one for each of its points.
+    #[inline(always)]
+    fn dense_rows(&self, cell: &[[u32; TILE]; 3], layer: &[u32; TILE], rows: &mut [[u32; TILE]; 8]) {
+        let [_, stride_y, stride_z, _] = self.stride;
+        for s in 0..TILE {
+            let [y, z] = [cell[1][s].wrapping_mul(stride_y), cell[2][s].wrapping_mul(stride_z)];
+            let first = cell[0][s].wrapping_add(y).wrapping_add(z).wrapping_add(layer[s]);
+            for n in 0..8 {
+                rows[n as usize][s] = first + (n & 1) + (n >> 1 & 1) * stride_y + (n >> 2) * stride_z;
+            }
+        }
+    }
+
+    /// Rows around cells of a lattice whose points share them by chance.
+    #[inline(always)]
+    fn hashed_rows(&self, cell: &[[u32; TILE]; 3], layer: &[u32; TILE], rows: &mut [[u32; TILE]; 8]) {
         let mask = self.rows as u32 - 1;
         let [_, stride_y, stride_z, _] = self.stride;
         for s in 0..TILE {
@@ -250,15 +274,8 @@ impl Lattice {
             let (y, z) = ([y, y.wrapping_add(stride_y)], [z, z.wrapping_add(stride_z)]);
             for dz in 0..2 {
                 for dy in 0..2 {
-                    let row = 4 * dz + 2 * dy;
-                    let [a, b] = if self.dense {
-                        let first = x.wrapping_add(y[dy]).wrapping_add(z[dz]).wrapping_add(t);
-                        [first, first.wrapping_add(1)]
-                    } else {
-                        let rest = y[dy] ^ z[dz] ^ t;
-                        [(x ^ rest) & mask, ((x + 1) ^ rest) & mask]
-                    };
-                    (rows[row][s], rows[row + 1][s]) = (a, b);
+                    let (n, rest) = (4 * dz + 2 * dy, y[dy] ^ z[dz] ^ t);
+                    (rows[n][s], rows[n + 1][s]) = ((x ^ rest) & mask, ((x + 1) ^ rest) & mask);
                 }
             }
         }
