@@ -78,8 +78,9 @@ impl WithSimd for NetworkPass<'_> {
                 }
             }
             Pass::Backward => {
-                net.reserve_backward(TILES, activations);
+                net.reserve_backward::<S>(TILES, activations);
                 for n in 0..TILES {
+                    activations.output_grad().fill(0.01);
                     net.backward(simd, &unit, packed, activations, n);
                 }
                 net.finish(simd, packed, activations, gradient);
@@ -97,11 +98,7 @@ fn networks(c: &mut Criterion) {
         let packed = net.pack(&params, precision);
         let mut activations = Activations::default();
         net.reserve(&packed, TILES, &mut activations);
-        net.reserve_backward(TILES, &mut activations);
-        for n in 0..TILES {
-            activations.input(n).fill_with(|| numbers.next());
-            activations.output_grad().fill_with(|| numbers.next());
-        }
+        (0..TILES).for_each(|n| activations.input(n).fill_with(|| numbers.next()));
         let mut gradient = vec![0.0; net.parameters()];
         // Backward, the gradients of inputs and of weights take as much as forward each.
         let passes = [("forward", Pass::Forward, 1.0), ("backward", Pass::Backward, 2.0)];
@@ -138,13 +135,13 @@ impl WithSimd for TablePass<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
+    fn with_simd<S: Simd>(self, simd: S) {
         let Self(level, points, table) = self;
         match table {
             Table::Encode(table, out) => level.encode(table, points, out, &mut Around::default()),
             Table::Scatter(table, g) => level.scatter(table, points, g, &mut Around::default()),
             Table::Update(state, table, gradient) => {
-                state.update(table, gradient, StepSize::new(1e-3, 10));
+                state.update(simd, table, gradient, StepSize::new(1e-3, 10));
             }
         }
     }
@@ -175,13 +172,14 @@ fn tables(c: &mut Criterion) {
     let mut group = c.benchmark_group("table");
     group.throughput(Throughput::Elements(POINTS as u64));
     group.sample_size(30);
-    floor("encode", lookups, MACHINE.rows);
+    let [read, added] = MACHINE.rows(1 << 17);
+    floor("encode", lookups, read);
     group.bench_function("encode", |b| {
         b.iter(|| {
             pulp::Arch::new().dispatch(TablePass(level, &points, Table::Encode(&table, &mut rows)));
         });
     });
-    floor("scatter", lookups, MACHINE.added_rows);
+    floor("scatter", lookups, added);
     group.bench_function("scatter", |b| {
         b.iter(|| {
             pulp::Arch::new().dispatch(TablePass(level, &points, Table::Scatter(&mut gradient, &rows)));
@@ -269,7 +267,7 @@ fn rays(c: &mut Criterion) {
     let mut group = c.benchmark_group("rays");
     group.throughput(Throughput::Elements((rays.len() * SAMPLING.count) as u64));
     // A quarter of the way is behind the wall; neighbouring steps share cache lines, so that a step is one load.
-    floor("sampler", 32.0 * 0.75 * 128.0, MACHINE.rows);
+    floor("sampler", 32.0 * 0.75 * 128.0, MACHINE.rows(1 << 17)[0]);
     group.bench_function("sampler", |b| {
         b.iter(|| pulp::Arch::new().dispatch(SamplerPass(&mut sampler, &wall, &rays, &mut edges)));
     });

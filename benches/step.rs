@@ -9,6 +9,7 @@
 //! change; for random cells of the density grids, too, networks as far as their densities. Choosing and cutting rays, compositing
 //! and loss are not in it.
 
+use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -33,12 +34,12 @@ const PARTS: usize = 8;
 const STEPS: usize = 20;
 
 /// What a step has to do at least.
-#[derive(Clone, Copy, Default)]
+#[derive(Default)]
 struct Work {
     flops: f64,
-    read_rows: f64,
+    /// Rows read and rows added to, of tables of so many rows each.
+    rows: BTreeMap<usize, [f64; 2]>,
     cells: f64,
-    added_rows: f64,
     bytes: f64,
 }
 
@@ -55,10 +56,11 @@ impl Work {
                 [net.trunk.multiply_adds() + net.head.multiply_adds(), density(&net.trunk)];
             // Backward, the gradients of inputs and of weights take as much as forward each.
             self.flops += 2.0 * ((faint + refreshed) * density as f64 + 3.0 * kept * whole as f64);
-            for level in &net.encoding.levels {
+            for (level, table) in net.encoding.levels.iter().zip(&field.tables[s]) {
                 let corners = level.corners() as f64;
-                self.read_rows += corners * (all + refreshed);
-                self.added_rows += corners * kept;
+                let [read, added] = self.rows.entry(table.len()).or_default();
+                *read += corners * (all + refreshed);
+                *added += corners * kept;
             }
         }
         // Values and two moments are read and written; gradients need not leave a near cache.
@@ -67,9 +69,13 @@ impl Work {
 
     /// Least seconds for networks, rows, moments and cells.
     fn seconds(&self, machine: &Machine, flops: f64) -> [f64; 4] {
-        let rows = self.read_rows / machine.rows + self.added_rows / machine.added_rows;
+        let rows = self.rows.iter().map(|(table, [read, added])| {
+            let rates = machine.rows(*table);
+            read / rates[0] + added / rates[1]
+        });
         // A cell is read as fast as a row, if its grid were in a near cache.
-        [self.flops / flops, rows, self.bytes / machine.bytes, self.cells / machine.rows]
+        let cells = self.cells / machine.rows(1 << 17)[0];
+        [self.flops / flops, rows.sum(), self.bytes / machine.bytes, cells]
     }
 }
 
@@ -83,61 +89,48 @@ fn density(trunk: &Mlp) -> usize {
 #[derive(Clone, Copy, Default)]
 struct Looked {
     steps: usize,
-    seconds: f64,
-    /// Placing, encoding, evaluating and updating.
-    phases: [f64; 4],
     evaluations: usize,
-    work: Work,
+    /// Seconds that networks, rows, moments and cells take at least.
+    floor: [f64; 4],
+    /// Seconds of all, of placing, encoding, evaluating and updating.
+    seconds: [f64; 5],
 }
 
 impl Looked {
-    /// Takes [`STEPS`] steps at the share `fraction` of the schedule.
-    fn at(trainer: &mut Trainer, fraction: f64) -> Result<Self, TrainError> {
-        let mut looked = Self::default();
+    /// Takes [`STEPS`] steps at the share `fraction` of the schedule, on what can do `flops` operations a second.
+    fn at(trainer: &mut Trainer, fraction: f64, machine: &Machine, flops: f64) -> Result<Self, TrainError> {
+        let (mut looked, mut work) = (Self { steps: STEPS, ..Self::default() }, Work::default());
         for _ in 0..STEPS {
             let start = Instant::now();
             let report = trainer.step(fraction, None)?;
-            looked.seconds += start.elapsed().as_secs_f64();
-            looked.work.add(&trainer.trained().field, &report);
+            looked.seconds[0] += start.elapsed().as_secs_f64();
+            (0..4).for_each(|n| looked.seconds[1 + n] += report.seconds[n]);
             looked.evaluations += report.evaluations.iter().sum::<usize>();
-            (0..4).for_each(|n| looked.phases[n] += report.seconds[n]);
-            looked.steps += 1;
+            work.add(&trainer.trained().field, &report);
         }
+        looked.floor = work.seconds(machine, flops);
         Ok(looked)
     }
 
     fn add(&mut self, other: &Self) {
         self.steps += other.steps;
-        self.seconds += other.seconds;
-        (0..4).for_each(|n| self.phases[n] += other.phases[n]);
         self.evaluations += other.evaluations;
-        let (work, more) = (&mut self.work, &other.work);
-        work.flops += more.flops;
-        work.read_rows += more.read_rows;
-        work.cells += more.cells;
-        work.added_rows += more.added_rows;
-        work.bytes += more.bytes;
+        self.floor.iter_mut().zip(other.floor).for_each(|(sum, x)| *sum += x);
+        self.seconds.iter_mut().zip(other.seconds).for_each(|(sum, x)| *sum += x);
     }
 
-    fn print(&self, name: &str, machine: &Machine, flops: f64) {
+    fn print(&self, name: &str) {
         let mean = |seconds: f64| 1e3 * seconds / self.steps as f64;
-        let parts = self.work.seconds(machine, flops);
-        let (floor, phases) = (parts.iter().sum::<f64>(), self.phases.map(mean));
-        println!(
-            "{name:>5} {:>11} {:>9.1} {:>5.1} {:>8.1} {:>6.1} {:>9.1} {:>5.1} {:>8.1} {:>9.1} {:>11.1} {:>9.1} {:>7.0} %",
-            self.evaluations / self.steps,
-            mean(parts[0]),
-            mean(parts[1]),
-            mean(parts[2]),
-            mean(parts[3]),
-            mean(floor),
-            mean(self.seconds),
-            phases[0],
-            phases[1],
-            phases[2],
-            phases[3],
-            100.0 * floor / self.seconds
-        );
+        let floor = self.floor.iter().sum::<f64>();
+        print!("{name:>5} {:>11}", self.evaluations / self.steps);
+        for (seconds, width) in self.floor.into_iter().zip([9, 5, 8, 6]) {
+            print!(" {:>width$.1}", mean(seconds));
+        }
+        print!(" {:>9.1}", mean(floor));
+        for (seconds, width) in self.seconds.into_iter().zip([6, 8, 9, 11, 9]) {
+            print!(" {:>width$.1}", mean(seconds));
+        }
+        println!(" {:>7.0} %", 100.0 * floor / self.seconds[0]);
     }
 }
 
@@ -150,7 +143,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     let steps = config.train.steps;
     let mut trainer = Trainer::new(&scene, &config)?;
-    let (mut parts, mut all) = (Vec::new(), Looked::default());
+    let threads = rayon::current_num_threads();
+    let rows: usize = trainer.trained().field.tables.iter().flatten().map(Vec::len).sum();
+    let bf16 = match config.train.precision {
+        Precision::Auto => matrix::available(),
+        precision => precision == Precision::Bf16,
+    };
+    println!(
+        "   at evaluations  networks  rows  moments  cells  floor/ms   time  placing  encoding  evaluating  updating    floor"
+    );
+    let mut all = Looked::default();
     for part in 0..PARTS {
         let fraction = (part as f64 + 0.5) / PARTS as f64;
         let before = (fraction * steps as f64) as u64;
@@ -158,45 +160,22 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         trainer.run(folder.path(), None, &mut |p| {
             if p.step >= before { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         })?;
-        let looked = Looked::at(&mut trainer, fraction)?;
+        // Right before, since the machine may not be ours alone; of values and two moments.
+        let machine = Machine::measure(threads, 3 * rows * size_of::<Row>());
+        let (flops, kind) = if bf16 { (machine.bf16_flops, "bf16") } else { (machine.flops, "f32") };
+        let [read, added] = machine.rows(1 << 17);
+        eprintln!(
+            "{threads} threads: {:.0} GFLOP/s in {kind}, {:.0} M rows of 2 MiB read and {:.0} M added to a second, {:.1} GB/s",
+            flops / 1e9,
+            read / 1e6,
+            added / 1e6,
+            machine.bytes / 1e9
+        );
+        let looked = Looked::at(&mut trainer, fraction, &machine, flops)?;
+        looked.print(&format!("{:.0} %", 100.0 * fraction));
         all.add(&looked);
-        parts.push((fraction, looked));
     }
-
-    let threads = rayon::current_num_threads();
-    let field = &trainer.trained().field;
-    let rows: usize = field.tables.iter().flatten().map(Vec::len).sum();
-    // Values and two moments.
-    let machine = Machine::measure(threads, 3 * rows * size_of::<Row>());
-    let bf16 = match config.train.precision {
-        Precision::Auto => matrix::available(),
-        precision => precision == Precision::Bf16,
-    };
-    let (flops, kind) = if bf16 { (machine.bf16_flops, "bf16") } else { (machine.flops, "f32") };
-    println!(
-        "machine, {threads} threads: {:.0} GFLOP/s in {kind}, {:.0} M random rows read and {:.0} M added to a second, \
-         {:.1} GB/s",
-        flops / 1e9,
-        machine.rows / 1e6,
-        machine.added_rows / 1e6,
-        machine.bytes / 1e9
-    );
-    let mean = |total: f64| total / all.steps as f64;
-    println!(
-        "a step: {:.2} GFLOP, {:.1} M rows read and {:.1} M added to, {:.0} MB of moments, {:.1} M cells passed",
-        mean(all.work.flops) / 1e9,
-        mean(all.work.read_rows) / 1e6,
-        mean(all.work.added_rows) / 1e6,
-        mean(all.work.bytes) / 1e6,
-        mean(all.work.cells) / 1e6
-    );
-    println!(
-        "   at evaluations  networks  rows  moments  cells  floor/ms  time  placing  encoding  evaluating  updating    floor"
-    );
-    for (fraction, looked) in &parts {
-        looked.print(&format!("{:.0} %", 100.0 * fraction), &machine, flops);
-    }
-    all.print("all", &machine, flops);
+    all.print("all");
     Ok(())
 }
 

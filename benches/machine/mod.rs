@@ -12,8 +12,8 @@ use rayon::prelude::*;
 /// Rounds of which the fastest counts.
 const ROUNDS: usize = 5;
 
-/// Rows of a table of 2 MiB, as a level has.
-const ROWS: usize = 1 << 17;
+/// Rows of the smallest and of the largest table that is measured, powers of two: 1 KiB and 16 MiB.
+const ROWS: [usize; 2] = [1 << 6, 1 << 20];
 
 /// Rates of some threads together.
 pub struct Machine {
@@ -21,10 +21,11 @@ pub struct Machine {
     pub flops: f64,
     /// The same in bf16 on the matrix units. Not measured: 2600 GFLOP/s a thread, unless `DIVFF_BF16_GFLOPS` says otherwise.
     pub bf16_flops: f64,
-    /// Rows of 16 bytes read a second from random places of a table of 2 MiB, one table a thread.
-    pub rows: f64,
+    /// Rows of 16 bytes read a second from tables of [`ROWS`], twice as many, and so on, one table a thread: in pairs of neighbours
+    /// at random places.
+    read: Vec<f64>,
     /// Rows added to a second there: read, and written back.
-    pub added_rows: f64,
+    added: Vec<f64>,
     /// Bytes a second read from wherever they are kept and written back.
     pub bytes: f64,
 }
@@ -39,13 +40,33 @@ impl Machine {
         pool.install(|| Self {
             flops: best(|| together(threads, || pulp::Arch::new().dispatch(MultiplyAdds))),
             bf16_flops: 1e9 * bf16 * threads as f64,
-            rows: best(|| together(threads, || pulp::Arch::new().dispatch(Reads(&vec![Row::ONE; ROWS])))),
-            added_rows: best(|| {
-                together(threads, || pulp::Arch::new().dispatch(Adds(&mut vec![Row::ONE; ROWS])))
-            }),
+            read: tables(threads, |table| pulp::Arch::new().dispatch(Reads(table))),
+            added: tables(threads, |table| pulp::Arch::new().dispatch(Adds(table))),
             bytes: bytes(threads, state),
         })
     }
+
+    /// Rows read and rows added to a second, of a table that is not smaller than the one for which this was measured.
+    pub fn rows(&self, table: usize) -> [f64; 2] {
+        let n = (table.clamp(ROWS[0], ROWS[1]) / ROWS[0]).ilog2() as usize;
+        [self.read[n], self.added[n]]
+    }
+}
+
+/// Best rates of what is done with a table of a thread's own, of all sizes.
+fn tables(threads: usize, work: impl Fn(&mut [Row]) -> f64 + Sync) -> Vec<f64> {
+    let sizes = ROWS.map(|rows| rows.ilog2());
+    let mut tables = vec![vec![Row::ONE; ROWS[1]]; threads];
+    (sizes[0]..=sizes[1])
+        .map(|log2| {
+            let mut round = || {
+                let start = Instant::now();
+                let done: f64 = tables.par_iter_mut().map(|table| work(&mut table[..1 << log2])).sum();
+                done / start.elapsed().as_secs_f64()
+            };
+            (0..ROUNDS).map(|_| round()).fold(0.0, f64::max)
+        })
+        .collect()
 }
 
 fn best(rate: impl Fn() -> f64) -> f64 {
@@ -111,26 +132,32 @@ impl WithSimd for MultiplyAdds {
     }
 }
 
-/// Times that [`LANES`] rows are read or added to.
-const TIMES: usize = 1 << 21;
+/// Times that [`LANES`] pairs of rows are read or added to.
+const TIMES: usize = 1 << 17;
 
 /// Sequences of random rows that do not wait for one another.
 const LANES: usize = 16;
 
-/// Random numbers of rows.
-struct Places([u32; LANES]);
+/// Random numbers of rows, as many of a table as a power of two.
+struct Places {
+    states: [u32; LANES],
+    /// Bits that are not of the number.
+    shift: u32,
+}
 
 impl Places {
-    fn new() -> Self {
-        Self(std::array::from_fn(|n| 2 * n as u32 + 1))
+    fn new(rows: usize) -> Self {
+        Self { states: std::array::from_fn(|n| 2 * n as u32 + 1), shift: u32::BITS - rows.ilog2() }
     }
 
     #[inline(always)]
     fn next(&mut self) -> [usize; LANES] {
-        for s in &mut self.0 {
-            *s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        let mut places = [0; LANES];
+        for (state, place) in self.states.iter_mut().zip(&mut places) {
+            *state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            *place = (*state >> self.shift) as usize;
         }
-        self.0.map(|s| (s >> 15) as usize % ROWS)
+        places
     }
 }
 
@@ -142,14 +169,14 @@ impl WithSimd for Reads<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) -> f64 {
-        let (mut places, mut sums) = (Places::new(), [Row::ZERO; 4]);
+        let (mut places, mut sums) = (Places::new(self.0.len()), [Row::ZERO; 4]);
         for _ in 0..TIMES {
             for (n, row) in places.next().into_iter().enumerate() {
-                sums[n % 4] += self.0[row];
+                sums[n % 4] += self.0[row] + self.0[row ^ 1];
             }
         }
         black_box(sums);
-        (LANES * TIMES) as f64
+        (2 * LANES * TIMES) as f64
     }
 }
 
@@ -161,13 +188,14 @@ impl WithSimd for Adds<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) -> f64 {
-        let mut places = Places::new();
+        let mut places = Places::new(self.0.len());
         for _ in 0..TIMES {
             for row in places.next() {
                 self.0[row] += Row::ONE;
+                self.0[row ^ 1] += Row::ONE;
             }
         }
         black_box(self.0);
-        (LANES * TIMES) as f64
+        (2 * LANES * TIMES) as f64
     }
 }

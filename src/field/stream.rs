@@ -12,9 +12,10 @@ use super::config::Widths;
 use super::encoding::{Encoding, Level};
 use super::hashgrid::{AXES, Around, FEATURES, Points, Row, TIME};
 use super::mlp::{Activations, Mlp, Packed};
+use crate::simd::floats::{Column, ColumnMut};
 use crate::simd::lanes::{self, Layout};
 use crate::simd::matrix::Unit;
-use crate::simd::{self, AlignedVec, TILE};
+use crate::simd::{AlignedVec, TILE};
 
 /// Raw densities are clamped to this before the exponential, so that neither σ nor its gradient overflows.
 const RAW_SIGMA_LIMIT: f32 = 15.0;
@@ -352,26 +353,21 @@ impl StreamNet {
             features.copy_from_slice(geometry);
             condition(rest, self.view, batch.rays(n), &view);
             self.head.forward(simd, &unit, w.head, head, n);
-            let mut raw = [[0.0; TILE]; 5];
-            raw[0].copy_from_slice(&geometry[..TILE]);
-            for (raw, row) in raw[1..].iter_mut().zip(head.output(n).chunks_exact(TILE)) {
-                raw.copy_from_slice(row);
+            let mut sigma = [0.0; TILE];
+            self.densities(simd, geometry, &mut sigma);
+            let mut rest = [0.0; 4 * TILE];
+            let (raw, mut rows) = (Column::new(simd, head.output(n)), ColumnMut::new(simd, &mut rest));
+            for v in 0..4 * TILE / S::F32_LANES {
+                rows.set(v, raw.at(v).sigmoid());
             }
-            for v in &mut raw[0] {
-                *v = simd::exp((*v + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
-            }
-            for row in &mut raw[1..] {
-                for v in row {
-                    *v = simd::sigmoid(*v);
-                }
-            }
+            let (rows, _) = rest.as_chunks::<TILE>();
             for (lane, &s) in lanes.iter().enumerate() {
                 let s = s as usize;
-                out.sigma[s] = raw[0][lane];
+                out.sigma[s] = sigma[lane];
                 for c in 0..3 {
-                    out.rgb[c][s] = raw[1 + c][lane];
+                    out.rgb[c][s] = rows[c][lane];
                 }
-                out.beta[s] = BETA_MAX * raw[4][lane];
+                out.beta[s] = BETA_MAX * rows[3][lane];
             }
         }
     }
@@ -398,9 +394,19 @@ impl StreamNet {
         for (tile, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
             let n = if kept { tile } else { 0 };
             self.trunk_forward(simd, &unit, w, batch, tile, trunk, n, &code, outputs);
-            for (o, r) in out.iter_mut().zip(trunk.output(n)) {
-                *o = simd::exp((*r + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT));
-            }
+            let mut sigma = [0.0; TILE];
+            self.densities(simd, trunk.output(n), &mut sigma);
+            out.copy_from_slice(&sigma[..out.len()]);
+        }
+    }
+
+    /// Densities of the samples of a tile, of which the first row of the trunk's `output` tells.
+    #[inline(always)]
+    fn densities<S: Simd>(&self, simd: S, output: &[f32], out: &mut [f32; TILE]) {
+        let (raw, mut out) = (Column::new(simd, &output[..TILE]), ColumnMut::new(simd, out));
+        for n in 0..TILE / S::F32_LANES {
+            let limited = (raw.at(n) + self.density_bias).clamp(-RAW_SIGMA_LIMIT, RAW_SIGMA_LIMIT);
+            out.set(n, limited.exp());
         }
     }
 
@@ -447,7 +453,7 @@ impl StreamNet {
     /// Back-propagates through the evaluation that [`Self::forward`] left in `activations`.
     ///
     /// `values` are its outputs, `grad` the loss's gradient with respect to them. Keeps the parameter gradients of trunk
-    /// and head for [`Self::finish`], replaces the encoding in `batch` by the gradient with respect to it, and calls `code(ray, component, gradient)` for every run of lanes of a ray and, if the batch has slopes,
+    /// and head for [`Self::finish`], replaces the encoding in `batch` by the gradient with respect to it, and calls `code(ray, component, gradient)` for every run of lanes of a ray and four components from `component` on and, if the batch has slopes,
     /// `position(ray, sample, gradient)` for every lane.
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
@@ -459,15 +465,15 @@ impl StreamNet {
         activations: &mut StreamActivations,
         values: &StreamSamples,
         grad: &StreamSamples,
-        mut code: impl FnMut(usize, usize, f32),
+        mut code: impl FnMut(usize, usize, Row),
         mut position: impl FnMut(usize, usize, Vec3),
     ) {
         let unit = Unit::detect();
         let StreamActivations { trunk, head } = activations;
         let StreamBatch { sample, ray, levels, slopes, .. } = batch;
         let tiles = sample.len().div_ceil(TILE);
-        self.trunk.reserve_backward(tiles, trunk);
-        self.head.reserve_backward(tiles, head);
+        self.trunk.reserve_backward::<S>(tiles, trunk);
+        self.head.reserve_backward::<S>(tiles, head);
         for (n, (lanes, rays)) in sample.chunks(TILE).zip(ray.chunks(TILE)).enumerate() {
             let mut raw = [[0.0; TILE]; 5];
             for (lane, &s) in lanes.iter().enumerate() {
@@ -494,8 +500,8 @@ impl StreamNet {
                 level.write_tile(n, g);
             }
             for (ray, run) in runs(rays) {
-                for (k, row) in rest.chunks_exact(TILE).take(self.code).enumerate() {
-                    code(ray, k, row[run.clone()].iter().sum());
+                for k in (0..self.code).step_by(FEATURES) {
+                    code(ray, k, sum_lanes(&rest[k * TILE..], run.clone()));
                 }
             }
             if *slopes {
@@ -550,6 +556,22 @@ fn condition<'c>(rows: &mut [f32], width: usize, rays: &[u32], of: impl Fn(usize
             }
         }
     }
+}
+
+/// Sums of some lanes of four rows of a tile.
+#[inline(always)]
+fn sum_lanes(rows: &[f32], lanes: Range<usize>) -> Row {
+    let (mut sum, mut lane) = (Row::ZERO, lanes.start);
+    let four = |k: usize, lane: usize| Row::from_slice(&rows[k * TILE + lane..][..FEATURES]);
+    while lane + FEATURES <= lanes.end {
+        let [a, b, c, d] = transposed([four(0, lane), four(1, lane), four(2, lane), four(3, lane)]);
+        sum += (a + b) + (c + d);
+        lane += FEATURES;
+    }
+    for lane in lane..lanes.end {
+        sum += Row::new(rows[lane], rows[TILE + lane], rows[2 * TILE + lane], rows[3 * TILE + lane]);
+    }
+    sum
 }
 
 /// Rays of a tile, and the lanes that each has there.

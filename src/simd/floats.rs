@@ -86,6 +86,12 @@ impl<S: Simd> Floats<S> {
         Self { values: self.simd.abs_f32s(self.values), ..self }
     }
 
+    /// Square root.
+    #[inline(always)]
+    pub fn sqrt(self) -> Self {
+        Self { values: self.simd.sqrt_f32s(self.values), ..self }
+    }
+
     /// e^x to 2 ulp for x in [-87, 88], clamped outside.
     ///
     /// Cody–Waite reduction to |r| ≤ ln2/2, degree-6 polynomial, exponent by bit arithmetic.
@@ -109,6 +115,12 @@ impl<S: Simd> Floats<S> {
         let exponent = simd.sub_u32s(simd.transmute_u32s_f32s(shifted.values), zero);
         let exponent = simd.wrapping_dyn_shl_u32s(exponent, simd.splat_u32s(23));
         p * Self { values: simd.transmute_f32s_u32s(exponent), ..self }
+    }
+
+    /// 1 / (1 + e^-x).
+    #[inline(always)]
+    pub fn sigmoid(self) -> Self {
+        1.0 / (1.0 + (0.0 - self).exp())
     }
 
     /// 1 - e^-x for x ≥ 0 without cancellation for thin samples.
@@ -194,20 +206,20 @@ mod tests {
     struct All<'a>(&'a [f32]);
 
     impl WithSimd for All<'_> {
-        type Output = Vec<[f32; 2]>;
+        type Output = Vec<[f32; 3]>;
 
         #[inline(always)]
-        fn with_simd<S: Simd>(self, simd: S) -> Vec<[f32; 2]> {
-            let mut out = [(); 2].map(|()| vec![0.0; self.0.len()]);
+        fn with_simd<S: Simd>(self, simd: S) -> Vec<[f32; 3]> {
+            let mut out = [(); 3].map(|()| vec![0.0; self.0.len()]);
             let x = Column::new(simd, self.0);
             for n in 0..self.0.len() / S::F32_LANES {
                 let x = x.at(n);
-                let found = [x.exp(), x.abs().one_minus_exp_neg()];
+                let found = [x.exp(), x.abs().one_minus_exp_neg(), x.sigmoid()];
                 for (out, found) in out.iter_mut().zip(found) {
                     ColumnMut::new(simd, out).set(n, found);
                 }
             }
-            out[0].iter().zip(&out[1]).map(|(a, b)| [*a, *b]).collect()
+            (0..self.0.len()).map(|n| [out[0][n], out[1][n], out[2][n]]).collect()
         }
     }
 
@@ -216,7 +228,8 @@ mod tests {
         let extreme = [0.0, -0.0, f32::MAX, f32::MIN, f32::INFINITY, f32::NEG_INFINITY, f32::NAN, 1e-40];
         let x: Vec<f32> = extreme.into_iter().chain((0..1016).map(|n| 0.2 * (n - 508) as f32)).collect();
         for (x, found) in x.iter().zip(pulp::Arch::new().dispatch(All(&x))) {
-            let alone = [Floats::one(*x).exp().value(), Floats::one(x.abs()).one_minus_exp_neg().value()];
+            let alone = Floats::one(*x);
+            let alone = [alone.exp(), alone.abs().one_minus_exp_neg(), alone.sigmoid()].map(Floats::value);
             for (a, b) in found.into_iter().zip(alone) {
                 assert!(a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan(), "{x}: {a} and {b}");
             }

@@ -1,6 +1,9 @@
 //! Adam (Kingma & Ba 2015) over flat weights and over hash-table rows.
 
+use pulp::{Scalar, Simd};
+
 use crate::field::hashgrid::{FEATURES, Row};
+use crate::simd::floats::{ColumnMut, Floats};
 
 /// Decay rates and the guard against division by zero; instant-ngp's values.
 const BETA1: f32 = 0.9;
@@ -70,7 +73,13 @@ impl TableState {
     ///
     /// Numbers without a gradient keep their moments: they were not seen, which is no evidence.
     #[inline(always)]
-    pub fn update(&mut self, table: &mut [Row], gradient: &mut [Row], step: StepSize) -> usize {
+    pub fn update<S: Simd>(
+        &mut self,
+        simd: S,
+        table: &mut [Row],
+        gradient: &mut [Row],
+        step: StepSize,
+    ) -> usize {
         let [w, g, m, v] =
             [table, gradient, &mut self.first, &mut self.second].map(bytemuck::cast_slice_mut::<Row, f32>);
         let (mut at, mut updated) = (0, 0);
@@ -82,7 +91,8 @@ impl TableState {
             let end = at.min(g.len());
             if start < end {
                 let run = start..end;
-                update_seen(&mut w[run.clone()], &mut g[run.clone()], &mut m[run.clone()], &mut v[run], step);
+                let seen = [&mut w[run.clone()], &mut g[run.clone()], &mut m[run.clone()], &mut v[run]];
+                update_seen(simd, seen, step);
                 updated += end - start;
             }
             at += LINE;
@@ -101,17 +111,36 @@ fn has_gradient(gradient: &[f32]) -> bool {
     line.iter().fold(false, |any, g| any | (*g != 0.0))
 }
 
-/// Updates the numbers that have a gradient and clears the gradients.
+/// Updates the numbers that have a gradient and clears the gradients, of values, gradients and both moments.
 #[inline(always)]
-fn update_seen(w: &mut [f32], g: &mut [f32], m: &mut [f32], v: &mut [f32], step: StepSize) {
-    for (((w, g), m), v) in w.iter_mut().zip(g).zip(m).zip(v) {
-        let (m1, v1) = (*m + (1.0 - BETA1) * (*g - *m), *v + (1.0 - BETA2) * (*g * *g - *v));
-        let w1 = *w - step.rate * m1 / ((v1 * step.correction).sqrt() + EPSILON);
-        let seen = *g != 0.0;
-        *w = if seen { w1 } else { *w };
-        *m = if seen { m1 } else { *m };
-        *v = if seen { v1 } else { *v };
-        *g = 0.0;
+fn update_seen<S: Simd>(simd: S, [w, g, m, v]: [&mut [f32]; 4], step: StepSize) {
+    let whole = w.len() - w.len() % S::F32_LANES;
+    let ((w, w_rest), (g, g_rest)) = (w.split_at_mut(whole), g.split_at_mut(whole));
+    let ((m, m_rest), (v, v_rest)) = (m.split_at_mut(whole), v.split_at_mut(whole));
+    update_vectors(simd, [w, g, m, v], step);
+    update_vectors(Scalar::new(), [w_rest, g_rest, m_rest, v_rest], step);
+}
+
+/// [`update_seen`] of whole vectors.
+///
+/// A loop over numbers would be compiled to store some of a vector and not others, at which many processors are slow.
+#[inline(always)]
+fn update_vectors<S: Simd>(simd: S, [w, g, m, v]: [&mut [f32]; 4], step: StepSize) {
+    let vectors = w.len() / S::F32_LANES;
+    let (mut w, mut g) = (ColumnMut::new(simd, w), ColumnMut::new(simd, g));
+    let (mut m, mut v) = (ColumnMut::new(simd, m), ColumnMut::new(simd, v));
+    let none = Floats::new(simd, 0.0);
+    let least = Floats::new(simd, f32::from_bits(1));
+    for n in 0..vectors {
+        let [w0, g0, m0, v0] = [w.at(n), g.at(n), m.at(n), v.at(n)];
+        let (m1, v1) = (m0 + (1.0 - BETA1) * (g0 - m0), v0 + (1.0 - BETA2) * (g0 * g0 - v0));
+        let w1 = w0 - step.rate * m1 / ((v1 * step.correction).sqrt() + EPSILON);
+        // What is no number is not below the least one: it is seen.
+        let size = g0.abs();
+        w.set(n, w0.where_greater(least, size, w1));
+        m.set(n, m0.where_greater(least, size, m1));
+        v.set(n, v0.where_greater(least, size, v1));
+        g.set(n, none);
     }
 }
 
@@ -135,10 +164,10 @@ mod tests {
         gradient[6].y = 0.0;
         let (mut all, mut all_table, mut all_gradient) = (state.clone(), table.clone(), gradient.clone());
         let step = StepSize::new(0.01, 5);
-        let updated = state.update(&mut table, &mut gradient, step);
+        let updated = state.update(Scalar::new(), &mut table, &mut gradient, step);
         let [w, g, m, v] = [&mut all_table, &mut all_gradient, &mut all.first, &mut all.second]
             .map(|rows| bytemuck::cast_slice_mut(rows));
-        update_seen(w, g, m, v, step);
+        update_seen(Scalar::new(), [w, g, m, v], step);
         assert_eq!((&table, &state.first, &state.second), (&all_table, &all.first, &all.second));
         assert!(gradient.iter().all(|g| *g == Row::ZERO));
         // Lines 4 to 7, 40 to 51, and what is left behind the last whole one.
@@ -150,7 +179,7 @@ mod tests {
         let mut table = vec![Row::ONE; 8];
         let mut gradient = vec![Row::ZERO; 8];
         gradient[5].z = f32::NAN;
-        TableState::new(8).update(&mut table, &mut gradient, StepSize::new(0.01, 1));
+        TableState::new(8).update(Scalar::new(), &mut table, &mut gradient, StepSize::new(0.01, 1));
         assert!(table[5].z.is_nan() && table[5].x == 1.0 && table[0] == Row::ONE);
     }
 }

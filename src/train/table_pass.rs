@@ -46,7 +46,7 @@ impl<'a, B: Iterator<Item = &'a StreamBatch>> WithSimd for TablePass<'_, B> {
     type Output = usize;
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) -> usize {
+    fn with_simd<S: Simd>(self, simd: S) -> usize {
         let Self { batches, number, level, table, state, rate, scratch } = self;
         let TableScratch { gradient, around } = &mut *scratch.mine();
         if gradient.len() < table.len() {
@@ -56,6 +56,6 @@ impl<'a, B: Iterator<Item = &'a StreamBatch>> WithSimd for TablePass<'_, B> {
         for batch in batches.filter(|b| !b.is_empty()) {
             level.scatter(gradient, batch.tiles(), &batch.levels[number].rows[..batch.len()], around);
         }
-        state.update(table, gradient, rate)
+        state.update(simd, table, gradient, rate)
     }
 }

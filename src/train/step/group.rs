@@ -299,7 +299,10 @@ impl TrainChunk {
                 &mut tracer.activations[s],
                 &traced.samples[s],
                 &gradient.samples[s],
-                |ray, k, g| codes[ray * net.code + k] += g,
+                |ray, first, g| {
+                    let code = codes[ray * net.code..][..net.code][first..].iter_mut();
+                    code.zip(g.to_array()).for_each(|(sum, g)| *sum += g);
+                },
                 |ray, sample, g| {
                     let (origin, dir) = &mut rays[ray];
                     *origin += g;
