@@ -222,9 +222,9 @@ fn matmul_of<S: Simd, const WIDE: usize>(
             }
             // Four inputs at a time, since counting takes instructions, too; and without iterators, of which the compiler may
             // leave calls, for which all sums would go through memory.
-            let mut rest = &x[group..];
+            let mut at = group;
             for w in w.as_chunks::<{ BLOCK * BLOCK }>().0 {
-                let x = &rest[..3 * groups + 1];
+                let Some(x) = x.get(at..at + 3 * groups + 1) else { break };
                 for k in 0..BLOCK {
                     let x = &x[k * groups];
                     for j in 0..BLOCK {
@@ -234,7 +234,7 @@ fn matmul_of<S: Simd, const WIDE: usize>(
                         }
                     }
                 }
-                rest = rest.get(BLOCK * groups..).unwrap_or_default();
+                at += BLOCK * groups;
             }
             let at = block * BLOCK * groups + group;
             finish_rows(simd, &acc, finish, at, groups, y);
