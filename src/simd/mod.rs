@@ -18,8 +18,8 @@ use self::floats::Floats;
 
 /// Samples per tile: three AVX-512 vectors, six AVX2 vectors or twelve NEON vectors.
 ///
-/// Three vectors times four outputs are the twelve independent accumulators that hide the latency of a fused
-/// multiply-add on two ports, and fit the sixteen registers of AVX2.
+/// A product takes three vectors by four outputs at a time where there are 32 registers: twelve sums, which hide the latency of a fused
+/// multiply-add on two ports. With AVX2's sixteen it takes two by four, since sums that do not fit go through memory.
 pub const TILE: usize = 48;
 
 /// One cache line of floats; gives [`AlignedVec`] its alignment.
