@@ -191,13 +191,16 @@ enum Finish<'a, V> {
 /// y = W x + b for one tile, finished; `w` is packed four outputs side by side.
 #[inline(always)]
 fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], finish: Finish<S::f32s>) {
-    match S::REGISTER_COUNT {
-        ..32 => matmul_of::<S, 2>(simd, w, bias, x, y, finish),
-        _ => matmul_of::<S, 3>(simd, w, bias, x, y, finish),
+    let vectors = TILE / S::F32_LANES;
+    // Sums that do not fit the registers would go through memory.
+    if S::REGISTER_COUNT < 32 && vectors.is_multiple_of(2) {
+        matmul_of::<S, 2>(simd, w, bias, x, y, finish);
+    } else {
+        matmul_of::<S, 3>(simd, w, bias, x, y, finish);
     }
 }
 
-/// [`matmul`], `WIDE` vectors side by side.
+/// [`matmul`], `WIDE` vectors, of which a tile has some multiple, side by side.
 #[inline(always)]
 fn matmul_of<S: Simd, const WIDE: usize>(
     simd: S,
