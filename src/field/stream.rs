@@ -453,8 +453,9 @@ impl StreamNet {
     /// Back-propagates through the evaluation that [`Self::forward`] left in `activations`.
     ///
     /// `values` are its outputs, `grad` the loss's gradient with respect to them. Keeps the parameter gradients of trunk
-    /// and head for [`Self::finish`], replaces the encoding in `batch` by the gradient with respect to it, and calls `code(ray, component, gradient)` for every run of lanes of a ray and four components from `component` on and, if the batch has slopes,
-    /// `position(ray, sample, gradient)` for every lane.
+    /// and head for [`Self::finish`], and replaces the encoding in `batch` by the gradient with respect to it. Calls `code(ray, component,
+    /// gradient)` for every run of lanes of a ray, with the gradients of four components from `component` on, and, if the batch has
+    /// slopes, `position(ray, sample, gradient)` for every lane.
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
     pub fn backward<S: Simd>(
