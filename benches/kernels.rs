@@ -20,10 +20,10 @@ use glam::Vec3;
 use pulp::{Simd, WithSimd};
 
 mod machine;
-use machine::Machine;
+use machine::{LEVEL_ROWS, Machine};
 
 /// Bytes of a level's table.
-const TABLE_BYTES: usize = size_of::<Row>() << 17;
+const TABLE_BYTES: usize = size_of::<Row>() * LEVEL_ROWS;
 
 static MACHINE: LazyLock<Machine> = LazyLock::new(|| Machine::measure(1, 3 * TABLE_BYTES));
 
@@ -172,7 +172,7 @@ fn tables(c: &mut Criterion) {
     let mut group = c.benchmark_group("table");
     group.throughput(Throughput::Elements(POINTS as u64));
     group.sample_size(30);
-    let [read, added] = MACHINE.rows(1 << 17);
+    let [read, added] = MACHINE.rows(LEVEL_ROWS);
     floor("encode", lookups, read);
     group.bench_function("encode", |b| {
         b.iter(|| {
@@ -267,7 +267,7 @@ fn rays(c: &mut Criterion) {
     let mut group = c.benchmark_group("rays");
     group.throughput(Throughput::Elements((rays.len() * SAMPLING.count) as u64));
     // A quarter of the way is behind the wall; neighbouring steps share cache lines, so that a step is one load.
-    floor("sampler", 32.0 * 0.75 * 128.0, MACHINE.rows(1 << 17)[0]);
+    floor("sampler", 32.0 * 0.75 * 128.0, MACHINE.rows(LEVEL_ROWS)[0]);
     group.bench_function("sampler", |b| {
         b.iter(|| pulp::Arch::new().dispatch(SamplerPass(&mut sampler, &wall, &rays, &mut edges)));
     });

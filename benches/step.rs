@@ -25,7 +25,7 @@ use divff::train::step::StepReport;
 use divff::train::{TrainError, Trainer};
 
 mod machine;
-use machine::Machine;
+use machine::{LEVEL_ROWS, Machine};
 
 /// Parts of the schedule, in the middle of each of which steps are looked at.
 const PARTS: usize = 8;
@@ -74,7 +74,7 @@ impl Work {
             read / rates[0] + added / rates[1]
         });
         // A cell is read as fast as a row, if its grid were in a near cache.
-        let cells = self.cells / machine.rows(1 << 17)[0];
+        let cells = self.cells / machine.rows(LEVEL_ROWS)[0];
         [self.flops / flops, rows.sum(), self.bytes / machine.bytes, cells]
     }
 }
@@ -163,7 +163,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         // Right before, since the machine may not be ours alone; of values and two moments.
         let machine = Machine::measure(threads, 3 * rows * size_of::<Row>());
         let (flops, kind) = if bf16 { (machine.bf16_flops, "bf16") } else { (machine.flops, "f32") };
-        let [read, added] = machine.rows(1 << 17);
+        let [read, added] = machine.rows(LEVEL_ROWS);
         eprintln!(
             "{threads} threads: {:.0} GFLOP/s in {kind}, {:.0} M rows of 2 MiB read and {:.0} M added to a second, {:.1} GB/s",
             flops / 1e9,

@@ -12,6 +12,9 @@ use rayon::prelude::*;
 /// Rounds of which the fastest counts.
 const ROUNDS: usize = 5;
 
+/// Rows of a table of 2 MiB, as most levels have.
+pub const LEVEL_ROWS: usize = 1 << 17;
+
 /// Rows of the smallest and of the largest table that is measured, powers of two: 1 KiB and 16 MiB.
 const ROWS: [usize; 2] = [1 << 6, 1 << 20];
 
@@ -38,7 +41,7 @@ impl Machine {
             rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads can be started");
         let bf16 = std::env::var("DIVFF_BF16_GFLOPS").ok().and_then(|v| v.parse().ok()).unwrap_or(2600.0);
         pool.install(|| Self {
-            flops: best(|| together(threads, || pulp::Arch::new().dispatch(MultiplyAdds))),
+            flops: best(|| together(&mut vec![(); threads], |()| pulp::Arch::new().dispatch(MultiplyAdds))),
             bf16_flops: 1e9 * bf16 * threads as f64,
             read: tables(threads, |table| pulp::Arch::new().dispatch(Reads(table))),
             added: tables(threads, |table| pulp::Arch::new().dispatch(Adds(table))),
@@ -55,41 +58,32 @@ impl Machine {
 
 /// Best rates of what is done with a table of a thread's own, of all sizes.
 fn tables(threads: usize, work: impl Fn(&mut [Row]) -> f64 + Sync) -> Vec<f64> {
-    let sizes = ROWS.map(|rows| rows.ilog2());
+    let [least, most] = ROWS.map(usize::ilog2);
     let mut tables = vec![vec![Row::ONE; ROWS[1]]; threads];
-    (sizes[0]..=sizes[1])
-        .map(|log2| {
-            let mut round = || {
-                let start = Instant::now();
-                let done: f64 = tables.par_iter_mut().map(|table| work(&mut table[..1 << log2])).sum();
-                done / start.elapsed().as_secs_f64()
-            };
-            (0..ROUNDS).map(|_| round()).fold(0.0, f64::max)
-        })
-        .collect()
+    (least..=most).map(|log2| best(|| together(&mut tables, |table| work(&mut table[..1 << log2])))).collect()
 }
 
-fn best(rate: impl Fn() -> f64) -> f64 {
+fn best(mut rate: impl FnMut() -> f64) -> f64 {
     (0..ROUNDS).map(|_| rate()).fold(0.0, f64::max)
 }
 
-/// What all threads do a second when each does `work`, which says how much that was.
-fn together(threads: usize, work: impl Fn() -> f64 + Sync) -> f64 {
+/// What all threads do a second when each does `work` on one of `states`, which says how much that was.
+fn together<T: Send>(states: &mut [T], work: impl Fn(&mut T) -> f64 + Sync) -> f64 {
     let start = Instant::now();
-    let done: f64 = (0..threads).into_par_iter().map(|_| work()).sum();
+    let done: f64 = states.par_iter_mut().map(&work).sum();
     done / start.elapsed().as_secs_f64()
 }
 
 fn bytes(threads: usize, state: usize) -> f64 {
     let mut floats = vec![1f32; (state / size_of::<f32>()).max(threads)];
     let chunk = floats.len().div_ceil(threads);
-    let mut round = || {
+    let round = || {
         let start = Instant::now();
         floats.par_chunks_mut(chunk).for_each(|c| pulp::Arch::new().dispatch(Rewrites(c)));
         // Read, and written.
         2.0 * state as f64 / start.elapsed().as_secs_f64()
     };
-    let fastest = (0..ROUNDS).map(|_| round()).fold(0.0, f64::max);
+    let fastest = best(round);
     black_box(&floats);
     fastest
 }

@@ -227,7 +227,7 @@ fn matmul_of<S: Simd, const WIDE: usize>(
             // leave calls, for which all sums would go through memory.
             let mut at = group;
             for w in w.as_chunks::<{ BLOCK * BLOCK }>().0 {
-                let Some(x) = x.get(at..at + 3 * groups + 1) else { break };
+                let x = &x[at..at + 3 * groups + 1];
                 for k in 0..BLOCK {
                     let x = &x[k * groups];
                     for j in 0..BLOCK {
