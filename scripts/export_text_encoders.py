@@ -26,22 +26,40 @@ UNCURLED = {**dict.fromkeys("\u2018\u2019\u201a\u201b\u02bc", "'"), **dict.fromk
 
 
 class ClipText(torch.nn.Module):
-    """Tokens [1, 77] of an OpenCLIP model to an embedding [1, D] of unit length."""
+    """Tokens [1, up to 77] of an OpenCLIP model to an embedding [1, D] of unit length.
+
+    Where every token sees only the ones before it and the embedding is the end's, padding behind the end changes
+    nothing: then any number of tokens is taken, else always the model's full context.
+    """
 
     inputs = ["input_ids"]
 
     def __init__(self, model):
         super().__init__()
         self.model = model
+        self.any_length = (getattr(model, "attn_mask", None) is not None
+                           and getattr(model, "text_pool_type", None) in ("argmax", "eos"))
 
     def forward(self, input_ids):
-        return self.model.encode_text(input_ids, normalize=True)
+        if not self.any_length:
+            return self.model.encode_text(input_ids, normalize=True)
+        from open_clip.transformer import text_global_pool
+        model, tokens = self.model, input_ids.shape[1]
+        x = model.token_embedding(input_ids) + model.positional_embedding[:tokens]
+        x = model.ln_final(model.transformer(x, attn_mask=model.attn_mask[:tokens, :tokens]))
+        x = text_global_pool(x, input_ids, model.text_pool_type, eos_token_id=getattr(model, "text_eos_id", None))
+        if isinstance(model.text_projection, torch.nn.Linear):
+            x = model.text_projection(x)
+        elif model.text_projection is not None:
+            x = x @ model.text_projection
+        return torch.nn.functional.normalize(x, dim=-1)
 
 
 class EgoVideoText(torch.nn.Module):
-    """Tokens and mask [1, 20] to an embedding [1, D] of unit length: BERT's first state, projected."""
+    """Tokens and mask [1, up to 20] to an embedding [1, D] of unit length: BERT's first state, projected."""
 
     inputs = ["input_ids", "attention_mask"]
+    any_length = True
 
     def __init__(self, bert, projection):
         super().__init__()
@@ -130,8 +148,10 @@ def export(module, tokenizer, out, space, name, context, pad):
     with torch.no_grad():
         dim = module(*example).shape[-1]
         path = f"{out}/model.onnx"
+        tokens = torch.export.Dim("tokens", min=2, max=context)
+        shapes = tuple({1: tokens} for _ in example) if module.any_length else None
         torch.onnx.export(module, example, path, input_names=module.inputs, output_names=["text_embedding"],
-                          opset_version=18, dynamo=True, external_data=False, verbose=False)
+                          dynamic_shapes=shapes, opset_version=18, dynamo=True, external_data=False, verbose=False)
     tokenizer.save(f"{out}/tokenizer.json")
     about = dict(space=space, model=name, context=context, pad=pad, dim=dim)
     with open(f"{out}/encoder.json.tmp", "w") as file:

@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
-use rten::{Model, NodeId, Value};
+use rten::{Dimension, Model, NodeId, Value};
 use tokenizers::Tokenizer;
 
 use super::TextError;
@@ -21,6 +21,8 @@ pub struct TextEncoder {
     ids: NodeId,
     mask: Option<NodeId>,
     output: NodeId,
+    /// The model takes any number of tokens up to its context: padding, which changes nothing, is left away.
+    any_length: bool,
 }
 
 impl TextEncoder {
@@ -44,7 +46,9 @@ impl TextEncoder {
         let mask = node("attention_mask");
         let output = node("text_embedding")
             .ok_or_else(|| bad("model.onnx", "it has no output `text_embedding`".into()))?;
-        Ok(Self { folder: folder.to_owned(), about, tokenizer, model, ids, mask, output })
+        let shape = model.node_info(ids).and_then(|info| info.shape()).unwrap_or_default();
+        let any_length = matches!(shape[..], [_, Dimension::Symbolic(_)]);
+        Ok(Self { folder: folder.to_owned(), about, tokenizer, model, ids, mask, output, any_length })
     }
 
     /// The space of its embeddings.
@@ -82,13 +86,16 @@ impl TextEncoder {
     /// # Errors
     /// [`TextError::Encoder`] if the model fails or its answer is not a finite embedding.
     pub fn embed(&self, text: &str) -> Result<Vec<f32>, TextError> {
-        let (ids, count) = self.tokens(text)?;
-        let context = ids.len();
+        let (mut ids, count) = self.tokens(text)?;
+        if self.any_length {
+            ids.truncate(count);
+        }
+        let length = ids.len();
         // ONNX's 64-bit integers are 32-bit ones in rten.
         let tensor = |values: Vec<i32>| {
-            Value::from_shape([1, context].as_slice(), values).map_err(|e| self.failed(e.to_string()))
+            Value::from_shape([1, length].as_slice(), values).map_err(|e| self.failed(e.to_string()))
         };
-        let mask: Vec<i32> = (0..context).map(|n| i32::from(n < count)).collect();
+        let mask: Vec<i32> = (0..length).map(|n| i32::from(n < count)).collect();
         let ids = tensor(ids.into_iter().map(|id| id as i32).collect())?;
         let mut inputs = vec![(self.ids, ids.into())];
         if let Some(node) = self.mask {
