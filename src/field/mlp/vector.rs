@@ -7,7 +7,7 @@ use glam::Vec4;
 use pulp::Simd;
 
 use super::{BLOCK, Layer};
-use crate::simd::{TILE, add_quarter_sums};
+use crate::simd::{PRODUCT_WIDTH, TILE, add_products, add_quarter_sums, prefetch};
 
 /// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
 pub struct Packed {
@@ -192,12 +192,18 @@ enum Finish<'a, V> {
 #[inline(always)]
 fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], finish: Finish<S::f32s>) {
     let vectors = TILE / S::F32_LANES;
-    // Sums that do not fit the registers would go through memory.
-    if S::REGISTER_COUNT < 32 && vectors.is_multiple_of(2) {
+    // Sums that do not fit the registers would go through memory, unless it is said which register is for what.
+    if S::REGISTER_COUNT < 32 && vectors.is_multiple_of(2) && !exact::<S, 3>() {
         matmul_of::<S, 2>(simd, w, bias, x, y, finish);
     } else {
         matmul_of::<S, 3>(simd, w, bias, x, y, finish);
     }
+}
+
+/// Whether `WIDE` vectors side by side are what [`add_products`] multiplies.
+#[inline(always)]
+fn exact<S: Simd, const WIDE: usize>() -> bool {
+    cfg!(target_arch = "x86_64") && S::REGISTER_COUNT < 32 && S::F32_LANES == 8 && WIDE * 8 == PRODUCT_WIDTH
 }
 
 /// [`matmul`], `WIDE` vectors, of which a tile has some multiple, side by side.
@@ -212,6 +218,7 @@ fn matmul_of<S: Simd, const WIDE: usize>(
 ) {
     let groups = TILE / S::F32_LANES / WIDE;
     let n_in = x.len() / TILE;
+    let floats = x;
     let x = S::as_simd_f32s(x).0.as_chunks::<WIDE>().0;
     let y = S::as_mut_simd_f32s(y).0.as_chunks_mut::<WIDE>().0;
     let zero = simd.splat_f32s(0.0);
@@ -223,11 +230,23 @@ fn matmul_of<S: Simd, const WIDE: usize>(
                     acc[j] = [simd.splat_f32s(b[j]); WIDE];
                 }
             }
+            let at = block * BLOCK * groups + group;
+            ask_for(y, at, groups);
+            if let Finish::Where(x) = finish {
+                ask_for(x.as_chunks::<WIDE>().0, at, groups);
+            }
+            if exact::<S, WIDE>()
+                && let [sums] = bytemuck::cast_slice_mut(acc.as_flattened_mut())
+            {
+                add_products(w.as_chunks().0, &floats[group * PRODUCT_WIDTH..], sums);
+                finish_rows(simd, &acc, finish, at, groups, y);
+                continue;
+            }
             // Four inputs at a time, since counting takes instructions, too; and without iterators, of which the compiler may
             // leave calls, for which all sums would go through memory.
-            let mut at = group;
+            let mut from = group;
             for w in w.as_chunks::<{ BLOCK * BLOCK }>().0 {
-                let x = &x[at..at + 3 * groups + 1];
+                let x = &x[from..from + 3 * groups + 1];
                 for k in 0..BLOCK {
                     let x = &x[k * groups];
                     for j in 0..BLOCK {
@@ -237,10 +256,21 @@ fn matmul_of<S: Simd, const WIDE: usize>(
                         }
                     }
                 }
-                at += BLOCK * groups;
+                from += BLOCK * groups;
             }
-            let at = block * BLOCK * groups + group;
             finish_rows(simd, &acc, finish, at, groups, y);
+        }
+    }
+}
+
+/// Asks for what [`finish_rows`] will read or write: there are more tiles in a chunk than a near cache holds.
+#[inline(always)]
+fn ask_for<T>(rows: &[T], at: usize, stride: usize) {
+    const LINE: usize = 64;
+    let rows = &rows[at..][..3 * stride + 1];
+    for j in 0..BLOCK {
+        for line in 0..size_of::<T>().div_ceil(LINE) {
+            prefetch(&rows[j * stride], line * LINE);
         }
     }
 }
