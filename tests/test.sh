@@ -3,9 +3,10 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-# Optimised as in a release, but not across crates: every test program would be optimised whole once more, half an hour
-# in all.
-export CARGO_PROFILE_RELEASE_LTO=off
+# Optimised as in a release, but neither across crates, for every test program would be optimised whole once more, nor our own
+# in one unit, which keeps one processor busy while others wait; and without lines for debuggers. Half an hour in all.
+export CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_DEBUG=none
+units=(--config profile.release.package.divff.codegen-units=16)
 
 step() {
     echo
@@ -45,7 +46,7 @@ step "documentation"
 RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps --locked --release
 
 step "tests, release"
-cargo test --workspace --locked --release
+cargo test --workspace --locked --release "${units[@]}"
 
 step "a build without text encoders"
 cargo clippy --package divff --lib --no-default-features --locked --release -- -D warnings
