@@ -8,44 +8,29 @@ use super::{PRODUCT_WIDTH, TILE};
 /// Numbers of a vector.
 const LANES: usize = 8;
 
-/// One input: its three vectors, and each of its four weights times all of them. Twelve sums, three vectors and a weight are all
-/// sixteen registers.
-macro_rules! input {
-    ($x:literal, $w:literal) => {
+/// Adds to the three sums of output `j` of `{a0}` to `{d2}` its weight of input number `k` times the input's vectors.
+macro_rules! output {
+    ($k:literal, $j:literal, $sums:literal) => {
         concat!(
-            "vmovups {x0}, [{x} + 192 * ",
-            $x,
-            "]\n",
-            "vmovups {x1}, [{x} + 192 * ",
-            $x,
-            " + 32]\n",
-            "vmovups {x2}, [{x} + 192 * ",
-            $x,
-            " + 64]\n",
-            "vbroadcastss {f}, [{w} + 16 * ",
-            $w,
-            "]\n",
-            "vfmadd231ps {a0}, {f}, {x0}\n",
-            "vfmadd231ps {a1}, {f}, {x1}\n",
-            "vfmadd231ps {a2}, {f}, {x2}\n",
-            "vbroadcastss {f}, [{w} + 16 * ",
-            $w,
-            " + 4]\n",
-            "vfmadd231ps {b0}, {f}, {x0}\n",
-            "vfmadd231ps {b1}, {f}, {x1}\n",
-            "vfmadd231ps {b2}, {f}, {x2}\n",
-            "vbroadcastss {f}, [{w} + 16 * ",
-            $w,
-            " + 8]\n",
-            "vfmadd231ps {c0}, {f}, {x0}\n",
-            "vfmadd231ps {c1}, {f}, {x1}\n",
-            "vfmadd231ps {c2}, {f}, {x2}\n",
-            "vbroadcastss {f}, [{w} + 16 * ",
-            $w,
-            " + 12]\n",
-            "vfmadd231ps {d0}, {f}, {x0}\n",
-            "vfmadd231ps {d1}, {f}, {x1}\n",
-            "vfmadd231ps {d2}, {f}, {x2}\n",
+            concat!("vbroadcastss {f}, [{w} + 16 * ", $k, " + 4 * ", $j, "]\n"),
+            concat!("vfmadd231ps {", $sums, "0}, {f}, {x0}\n"),
+            concat!("vfmadd231ps {", $sums, "1}, {f}, {x1}\n"),
+            concat!("vfmadd231ps {", $sums, "2}, {f}, {x2}\n"),
+        )
+    };
+}
+
+/// Input number `k` of a round. Twelve sums, three vectors and a weight are all sixteen registers.
+macro_rules! input {
+    ($k:literal) => {
+        concat!(
+            concat!("vmovups {x0}, [{x} + 192 * ", $k, "]\n"),
+            concat!("vmovups {x1}, [{x} + 192 * ", $k, " + 32]\n"),
+            concat!("vmovups {x2}, [{x} + 192 * ", $k, " + 64]\n"),
+            output!($k, 0, "a"),
+            output!($k, 1, "b"),
+            output!($k, 2, "c"),
+            output!($k, 3, "d"),
         )
     };
 }
@@ -70,10 +55,10 @@ pub fn add_products(w: &[[f32; 4]], x: &[f32], sums: &mut [[f32; PRODUCT_WIDTH];
     unsafe {
         asm!(
             "2:",
-            input!("0", "0"),
-            input!("1", "1"),
-            input!("2", "2"),
-            input!("3", "3"),
+            input!(0),
+            input!(1),
+            input!(2),
+            input!(3),
             "add {x}, 768",
             "add {w}, 64",
             "cmp {w}, {end}",
