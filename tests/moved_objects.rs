@@ -65,7 +65,7 @@ fn on_the_synthetic_kitchen() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene");
     generate(&SynthOptions { frames: 200, ..SynthOptions::default() }, &path).unwrap();
-    let ([right, mirrored], views) = found(&path, &settings(1000));
+    let ([right, mirrored], views) = found(&path, &settings(1400));
     assert!(views >= 20, "{views} views are too few to tell");
     assert!(right >= 0.6, "moved objects are found in {right:.2} of {views} views only");
     assert!(mirrored <= right - 0.2, "at another time as well ({mirrored:.2}): time does not count");
