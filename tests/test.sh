@@ -6,7 +6,10 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # Optimised as in a release, but neither across crates, for every test program would be optimised whole once more, nor our own
 # in one unit, which keeps one processor busy while others wait; and without lines for debuggers. Half an hour in all.
 export CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_DEBUG=none
-units=(--config profile.release.package.divff.codegen-units=16)
+profile=(--config profile.release.package.divff.codegen-units=16)
+# Where files are read, numbers that overflow and assertions that do not hold count as well.
+profile+=(--config profile.release.package.divff-exporters.overflow-checks=true)
+profile+=(--config profile.release.package.divff-exporters.debug-assertions=true)
 
 step() {
     echo
@@ -46,12 +49,9 @@ step "documentation"
 RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps --locked --release
 
 step "tests, release"
-cargo test --workspace --locked --release "${units[@]}"
+cargo test --workspace --locked --release "${profile[@]}"
 
 step "a build without text encoders"
 cargo clippy --package divff --lib --no-default-features --locked --release -- -D warnings
-
-step "tests of the file formats, with overflow checks and debug assertions"
-cargo test --package divff-exporters --locked
 
 step "all passed"
