@@ -203,7 +203,7 @@ fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], f
 /// Whether `WIDE` vectors side by side are what [`add_products`] multiplies.
 #[inline(always)]
 fn exact<S: Simd, const WIDE: usize>() -> bool {
-    cfg!(target_arch = "x86_64") && S::REGISTER_COUNT < 32 && S::F32_LANES == 8 && WIDE * 8 == PRODUCT_WIDTH
+    cfg!(target_arch = "x86_64") && S::F32_LANES == 8 && S::F32_LANES * WIDE == PRODUCT_WIDTH
 }
 
 /// [`matmul`], `WIDE` vectors, of which a tile has some multiple, side by side.
