@@ -1,12 +1,13 @@
-//! Pick and place: what is moved is found where it is at that time, and not where it was.
+//! Pick and place: that something moves is found out, and what is moved where it is at that time, and not where it was.
 
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use divff::config::{Config, Preset};
 use divff::pipeline::{self, Cost, Event, Observer, RunFolder};
 use divff::scene::{Scene, Split};
 use divff::synth::{SynthOptions, generate};
-use divff::train::StreamChoice;
+use divff::train::{Progress, StreamChoice, Trainer};
 
 /// Nobody listens.
 struct Quiet;
@@ -71,16 +72,56 @@ fn on_the_synthetic_kitchen() {
     assert!(mirrored <= right - 0.2, "at another time as well ({mirrored:.2}): time does not count");
 }
 
-#[test]
-fn on_the_rendered_kitchen() {
+/// A folder of the real and rendered scenes; says so where it is not there.
+fn data(name: &str) -> Option<PathBuf> {
     let root = std::env::var_os("DIVFF_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
-    let path = root.join("kitchen-a");
+    let path = root.join(name);
     if !path.is_dir() {
-        eprintln!("SKIPPED: no kitchen-a in {}; set DIVFF_DATA to run this test", root.display());
-        return;
+        eprintln!("SKIPPED: no {name} in {}; set DIVFF_DATA to run this test", root.display());
+        return None;
     }
+    Some(path)
+}
+
+#[test]
+fn on_the_rendered_kitchen() {
+    let Some(path) = data("kitchen-a") else { return };
     let ([right, mirrored], views) = found(&path, &settings(2000));
     assert!(right >= 0.6, "moved objects are found in {right:.2} of {views} views only");
     assert!(mirrored <= right - 0.2, "at another time as well ({mirrored:.2}): time does not count");
+}
+
+/// Which streams a draft of a scene keeps, and the share of wrong blocks by which that is decided.
+fn kept_streams(path: &Path) -> ([bool; 3], f64) {
+    let run = tempfile::tempdir().unwrap();
+    let scene = Scene::open(path).unwrap();
+    let mut trainer = Trainer::new(&scene, &Config::preset(Preset::Draft)).unwrap();
+    let mut until_settled = |p: &Progress| match p.step {
+        ..500 => ControlFlow::Continue(()),
+        _ => ControlFlow::Break(()),
+    };
+    trainer.run(run.path(), None, &mut until_settled).unwrap();
+    let trained = trainer.trained();
+    let unexplained = trained.progress.unexplained.expect("a draft has settled its streams by now");
+    println!("{}: {:.1} % of the blocks are wrong", path.display(), 100.0 * unexplained);
+    (trained.field.shape.streams, unexplained)
+}
+
+#[test]
+fn streams_that_a_scene_needs_are_trained_and_no_others() {
+    let folder = tempfile::tempdir().unwrap();
+    let synthetic = folder.path().join("scene");
+    generate(&SynthOptions::default(), &synthetic).unwrap();
+    // The border is at 4 %; nothing here may be near it.
+    let (streams, unexplained) = kept_streams(&synthetic);
+    assert!(streams == [true; 3] && unexplained > 0.06, "{streams:?} {unexplained}");
+    if let Some(rendered) = data("kitchen-a") {
+        let (streams, unexplained) = kept_streams(&rendered);
+        assert!(streams == [true; 3] && unexplained > 0.06, "{streams:?} {unexplained}");
+    }
+    if let Some(still) = data("redkitchen") {
+        let (streams, unexplained) = kept_streams(&still);
+        assert!(streams == [true, false, false] && unexplained < 0.03, "{streams:?} {unexplained}");
+    }
 }

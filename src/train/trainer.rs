@@ -113,16 +113,7 @@ impl Trainer {
         let grids = Grids::new(&field, config.train.grid_cells);
         let optimiser = Optimiser::new(&field);
         let trained = Trained { field, grids, progress: TrainingState::default() };
-        Ok(Self {
-            config: config.clone(),
-            streams: [true, false, false],
-            trained,
-            optimiser,
-            pixels,
-            test,
-            masks,
-            stereo_cost: None,
-        })
+        Ok(Self::with(config, trained, optimiser, [pixels, test], masks))
     }
 
     /// A trainer that goes on where the checkpoint in `run` ends.
@@ -134,20 +125,25 @@ impl Trainer {
         let (trained, optimiser) = Trained::resume(run)?;
         let (pixels, test) = load(scene, config)?;
         let masks = load_masks(scene, config, &pixels)?;
+        Ok(Self::with(config, trained, optimiser, [pixels, test], masks))
+    }
+
+    fn with(
+        config: &Config,
+        trained: Trained,
+        optimiser: Optimiser,
+        [pixels, test]: [PixelSet; 2],
+        masks: Option<FrameMasks>,
+    ) -> Self {
         let streams = match trained.progress.streams_settled {
             true => trained.field.shape.streams,
             false => [true, false, false],
         };
-        Ok(Self {
-            config: config.clone(),
-            trained,
-            optimiser,
-            pixels,
-            test,
-            masks,
-            streams,
-            stereo_cost: None,
-        })
+        let config = config.clone();
+        let mut trainer =
+            Self { config, trained, optimiser, pixels, test, masks, streams, stereo_cost: None };
+        trainer.keep_frames_back();
+        trainer
     }
 
     /// Trains to the end of the schedule, or until `budget` is used up (the schedule then follows the clock), or
