@@ -160,7 +160,7 @@ fn killed_training_goes_on_to_the_bytes_of_an_undisturbed_run() {
 
 #[test]
 fn a_killed_export_leaves_old_and_new_files_and_the_next_one_is_complete() {
-    let (run, _) = undisturbed();
+    let run = kit::run();
     let base = folder("kill-export");
     let export = |out: &Path, voxel: &str| {
         ["export", arg(run), "--out", arg(out), "--voxel", voxel].map(str::to_owned).to_vec()

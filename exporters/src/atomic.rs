@@ -56,6 +56,15 @@ pub fn write_bytes_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
     write_atomically(path, |file| file.write_all(bytes))
 }
 
+/// Checks that files can be made and written in `folder`.
+///
+/// # Errors
+/// What the system says of it; nothing is left there either way, nor what a killed check has left.
+pub fn check_writable(folder: &Path) -> io::Result<()> {
+    let (mut file, _cleanup) = create_temp_beside(&folder.join("probe"))?;
+    file.write_all(b"probe")
+}
+
 fn write_and_replace(path: &Path, write: impl FnOnce(&mut AtomicWriter) -> io::Result<()>) -> io::Result<()> {
     let (file, mut cleanup) = create_temp_beside(path)?;
     let mut writer = BufWriter::with_capacity(BUFFER_BYTES, file);
@@ -115,6 +124,19 @@ mod tests {
             .collect();
         names.sort();
         names
+    }
+
+    #[test]
+    fn a_folder_that_can_be_written_is_left_as_it_was() {
+        let folder = tempfile::tempdir().unwrap();
+        // Of a check that was killed.
+        fs::write(folder.path().join(".probe.4000000000-0.tmp"), b"probe").unwrap();
+        fs::write(folder.path().join("map.bin"), b"old").unwrap();
+        check_writable(folder.path()).unwrap();
+        assert_eq!(names_in(folder.path()), ["map.bin"]);
+        let missing = check_writable(&folder.path().join("missing")).unwrap_err();
+        assert_eq!(missing.kind(), io::ErrorKind::NotFound);
+        assert!(check_writable(&folder.path().join("map.bin")).is_err(), "a file is no folder");
     }
 
     #[test]

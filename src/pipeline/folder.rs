@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use divff_exporters::atomic::write_bytes_atomically;
+use divff_exporters::atomic::{check_writable, write_bytes_atomically};
 use serde::{Deserialize, Serialize};
 
 use super::PipelineError;
@@ -226,9 +226,7 @@ fn difference(key: &str, stored: Option<&toml::Value>, asked: Option<&toml::Valu
 pub fn create_writable(folder: &Path) -> Result<(), PipelineError> {
     let io = |source| PipelineError::Unwritable { path: folder.to_owned(), source };
     fs::create_dir_all(folder).map_err(io)?;
-    let probe = folder.join(format!(".divff-probe-{}", std::process::id()));
-    fs::write(&probe, b"probe").map_err(io)?;
-    fs::remove_file(&probe).map_err(io)
+    check_writable(folder).map_err(io)
 }
 
 fn unusable(path: &Path, what: String) -> BadFile {
