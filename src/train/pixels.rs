@@ -25,8 +25,6 @@ pub struct PixelSet {
     pub moving: Volume,
     /// Indices of usable pixels where a frame has a mask.
     usable: Vec<Option<Vec<u32>>>,
-    /// Whether a frame is kept back: no ray is drawn from it.
-    kept_back: Vec<bool>,
     /// Where rays go.
     novelty: Novelty,
     /// Half-way to the frames before and after each frame.
@@ -63,8 +61,8 @@ impl PixelSet {
             })
             .collect();
         let (spans, novelty) = (spans(&frames), Novelty::new(&frames, size, novelty));
-        let (stereo, moving, kept_back) = (Vec::new(), Volume::default(), vec![false; frames.len()]);
-        Ok(Self { frames, images, stereo, moving, usable, kept_back, novelty, spans, cameras, camera_of })
+        let (stereo, moving) = (Vec::new(), Volume::default());
+        Ok(Self { frames, images, stereo, moving, usable, novelty, spans, cameras, camera_of })
     }
 
     /// Directions of all pixels of frame `n` in camera axes.
@@ -165,35 +163,18 @@ impl PixelSet {
 
     /// Whether any frame has a usable pixel.
     pub fn has_usable(&self) -> bool {
-        self.usable.iter().any(any_usable)
-    }
-
-    /// Draws no ray from `frames`, and from all others, from now on; from all frames if the others have no usable pixel.
-    pub fn keep_back(&mut self, frames: &[usize]) {
-        self.kept_back.fill(false);
-        for n in frames {
-            self.kept_back[*n] = true;
-        }
-        let left = self.usable.iter().zip(&self.kept_back).any(|(list, kept)| !kept && any_usable(list));
-        if !left {
-            self.kept_back.fill(false);
-        }
+        self.usable.iter().any(|list| list.as_ref().is_none_or(|list| !list.is_empty()))
     }
 
     /// Number of a frame and a usable pixel of it. There must be one.
     pub fn draw(&self, rng: &mut Rng) -> (usize, usize) {
         loop {
             let (frame, pixel) = self.novelty.draw(&self.frames, rng);
-            if !self.kept_back[frame] && self.is_usable(frame, pixel as u32) {
+            if self.is_usable(frame, pixel as u32) {
                 return (frame, pixel);
             }
         }
     }
-}
-
-/// Whether a frame with these usable pixels, all if there is no list, has any.
-fn any_usable(list: &Option<Vec<u32>>) -> bool {
-    list.as_ref().is_none_or(|list| !list.is_empty())
 }
 
 /// For each frame the middles between its time and the next other times before and after it; its own where there is none.
@@ -214,30 +195,6 @@ fn spans(frames: &[Frame]) -> Vec<[f64; 2]> {
 mod tests {
     use super::*;
     use crate::render::testing::frame;
-    use crate::train::testing;
-
-    #[test]
-    fn no_ray_comes_from_frames_that_are_kept_back() {
-        let folder = tempfile::tempdir().expect("a temporary folder");
-        let frames = testing::frames(folder.path());
-        let count = frames.len();
-        let mut pixels = PixelSet::load(frames, 1.0, 0.3).expect("the test's frames can be read");
-        let drawn = |pixels: &PixelSet| {
-            let mut rng = Rng::new(1, 2, 3);
-            let mut seen = vec![false; count];
-            (0..400).for_each(|_| seen[pixels.draw(&mut rng).0] = true);
-            seen
-        };
-        let all = vec![true; count];
-        assert_eq!(drawn(&pixels), all);
-        pixels.keep_back(&[1]);
-        assert_eq!(drawn(&pixels), (0..count).map(|n| n != 1).collect::<Vec<_>>());
-        pixels.keep_back(&[]);
-        assert_eq!(drawn(&pixels), all);
-        // Somewhere rays have to come from.
-        pixels.keep_back(&(0..count).collect::<Vec<_>>());
-        assert_eq!(drawn(&pixels), all);
-    }
 
     #[test]
     fn frames_span_the_time_to_half_way_between_them() {

@@ -113,7 +113,16 @@ impl Trainer {
         let grids = Grids::new(&field, config.train.grid_cells);
         let optimiser = Optimiser::new(&field);
         let trained = Trained { field, grids, progress: TrainingState::default() };
-        Ok(Self::with(config, trained, optimiser, [pixels, test], masks))
+        Ok(Self {
+            config: config.clone(),
+            streams: [true, false, false],
+            trained,
+            optimiser,
+            pixels,
+            test,
+            masks,
+            stereo_cost: None,
+        })
     }
 
     /// A trainer that goes on where the checkpoint in `run` ends.
@@ -125,25 +134,20 @@ impl Trainer {
         let (trained, optimiser) = Trained::resume(run)?;
         let (pixels, test) = load(scene, config)?;
         let masks = load_masks(scene, config, &pixels)?;
-        Ok(Self::with(config, trained, optimiser, [pixels, test], masks))
-    }
-
-    fn with(
-        config: &Config,
-        trained: Trained,
-        optimiser: Optimiser,
-        [pixels, test]: [PixelSet; 2],
-        masks: Option<FrameMasks>,
-    ) -> Self {
         let streams = match trained.progress.streams_settled {
             true => trained.field.shape.streams,
             false => [true, false, false],
         };
-        let config = config.clone();
-        let mut trainer =
-            Self { config, trained, optimiser, pixels, test, masks, streams, stereo_cost: None };
-        trainer.keep_frames_back();
-        trainer
+        Ok(Self {
+            config: config.clone(),
+            trained,
+            optimiser,
+            pixels,
+            test,
+            masks,
+            streams,
+            stereo_cost: None,
+        })
     }
 
     /// Trains to the end of the schedule, or until `budget` is used up (the schedule then follows the clock), or

@@ -4,12 +4,10 @@ use super::Trainer;
 use crate::render::forward::Model;
 use crate::render::image::render;
 use crate::train::config::StreamChoice;
+use crate::train::pixels::PixelSet;
 
-/// Training frames that are looked at to decide whether anything moves, at most about.
+/// Frames that are looked at to decide whether anything moves, at most.
 const LOOK_AT_FRAMES: usize = 24;
-
-/// They are one of so many at most.
-const LOOK_AT_EVERY: usize = 4;
 
 /// Every how many pixels they are looked at, and how many of those make a block's side.
 const LOOK_STRIDE: u32 = 4;
@@ -21,7 +19,7 @@ const WRONG_COLOUR: f32 = 0.12;
 /// Steps after which a persistent stream is sharp enough for that.
 const SETTLE_AFTER: u64 = 500;
 
-/// Share of such blocks above which something moves: of frames that nothing was learned from, rooms where nothing moves have 1 to 2 %,
+/// Share of such blocks above which something moves: of held-out frames, rooms where nothing moves have 1 to 2 %,
 /// kitchens with someone at work 9 to 20 %.
 const MOVING_SHARE: f64 = 0.04;
 
@@ -34,14 +32,6 @@ impl Trainer {
         fraction >= share && (self.trained.progress.step >= SETTLE_AFTER || fraction >= late)
     }
 
-    /// Learns nothing, until that is decided, from the frames by which it will be: a cloud in front of each camera explains
-    /// whatever moves in a frame that was learned from, but shows in the others.
-    pub(super) fn keep_frames_back(&mut self) {
-        if self.config.train.streams == StreamChoice::Auto && !self.trained.progress.streams_settled {
-            self.pixels.keep_back(&looked_at(self.pixels.frames.len()));
-        }
-    }
-
     /// Decides which streams the scene needs, once the persistent one has had its time alone.
     pub(super) fn settle_streams(&mut self) {
         if self.config.train.streams == StreamChoice::Auto {
@@ -52,7 +42,6 @@ impl Trainer {
                 self.optimiser.keep_streams(&self.trained.field);
             }
         }
-        self.pixels.keep_back(&[]);
         self.streams = self.trained.field.shape.streams;
         self.trained.progress.streams_settled = true;
     }
@@ -60,24 +49,23 @@ impl Trainer {
     /// Share of image blocks whose mean colour the persistent stream gets wrong.
     ///
     /// Blur, noise and misplaced edges average out over a block; a hand or an object that has moved does not.
+    ///
+    /// Held-out frames tell, where there are any: a cloud in front of each camera explains whatever moves in a frame that was
+    /// learned from, but shows in the others.
     fn unexplained(&self) -> f64 {
-        let pixels = &self.pixels;
-        let frames = pixels.frames.len();
-        let mut looked_at = looked_at(frames);
-        if looked_at.is_empty() {
-            looked_at = (0..frames).collect();
-        }
-        let (wrong, blocks) = looked_at.into_iter().fold((0, 0), |sum, n| {
-            let frame = self.wrong_blocks(n);
+        let pixels = if self.test.frames.is_empty() { &self.pixels } else { &self.test };
+        let every = pixels.frames.len().div_ceil(LOOK_AT_FRAMES).max(1);
+        let (wrong, blocks) = (0..pixels.frames.len()).step_by(every).fold((0, 0), |sum, n| {
+            let frame = self.wrong_blocks(pixels, n);
             (sum.0 + frame.0, sum.1 + frame.1)
         });
         wrong as f64 / blocks.max(1) as f64
     }
 
     /// Blocks of frame `n` whose mean colour the persistent stream gets wrong, and all blocks without a pixel that its mask takes away.
-    fn wrong_blocks(&self, n: usize) -> (usize, usize) {
+    fn wrong_blocks(&self, pixels: &PixelSet, n: usize) -> (usize, usize) {
         let model = Model::new(&self.trained.field, &self.trained.grids, [true, false, false]);
-        let (pixels, frame) = (&self.pixels, &self.pixels.frames[n]);
+        let frame = &pixels.frames[n];
         let image = render(&model, frame, &self.config.train.render_sampling(), LOOK_STRIDE);
         let (mut wrong, mut blocks) = (0, 0);
         for block in 0..(image.height / LOOK_BLOCK) * (image.width / LOOK_BLOCK) {
@@ -101,10 +89,4 @@ impl Trainer {
         }
         (wrong, blocks)
     }
-}
-
-/// Which of so many frames are looked at, evenly over the video; none of one or two.
-fn looked_at(frames: usize) -> Vec<usize> {
-    let every = frames.div_ceil(LOOK_AT_FRAMES).max(LOOK_AT_EVERY);
-    (every / 2..frames).step_by(every).collect()
 }
