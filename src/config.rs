@@ -75,9 +75,8 @@ impl Config {
     pub fn preset(preset: Preset) -> Self {
         let mut config = Self::default();
         match preset {
-            // Of few rays, more steps of fewer each teach more: poses and what moves wait for steps.
+            // In a short time more steps, of fewer rays with fewer samples, teach more: poses and what moves wait for steps.
             Preset::Draft => {
-                // More steps are worth more than more samples.
                 (config.train.steps, config.train.rays, config.train.samples) = (1400, 2048, 12);
                 // An alignment takes as long as a hundred of its steps.
                 config.train.align_at = vec![0.17, 0.3, 0.45, 0.6];

@@ -54,22 +54,23 @@ impl Trainer {
     /// learned from, but shows in the others.
     fn unexplained(&self) -> f64 {
         let pixels = if self.test.frames.is_empty() { &self.pixels } else { &self.test };
+        let model = Model::new(&self.trained.field, &self.trained.grids, [true, false, false]);
         let every = pixels.frames.len().div_ceil(LOOK_AT_FRAMES).max(1);
         let (wrong, blocks) = (0..pixels.frames.len()).step_by(every).fold((0, 0), |sum, n| {
-            let frame = self.wrong_blocks(pixels, n);
+            let frame = self.wrong_blocks(&model, pixels, n);
             (sum.0 + frame.0, sum.1 + frame.1)
         });
         wrong as f64 / blocks.max(1) as f64
     }
 
-    /// Blocks of frame `n` whose mean colour the persistent stream gets wrong, and all blocks without a pixel that its mask takes away.
-    fn wrong_blocks(&self, pixels: &PixelSet, n: usize) -> (usize, usize) {
-        let model = Model::new(&self.trained.field, &self.trained.grids, [true, false, false]);
+    /// Numbers of blocks of frame `n`: those whose mean colour `model` gets wrong, and all; without those that a mask takes pixels away from.
+    fn wrong_blocks(&self, model: &Model, pixels: &PixelSet, n: usize) -> (usize, usize) {
         let frame = &pixels.frames[n];
-        let image = render(&model, frame, &self.config.train.render_sampling(), LOOK_STRIDE);
+        let image = render(model, frame, &self.config.train.render_sampling(), LOOK_STRIDE);
+        let (columns, rows) = (image.width / LOOK_BLOCK, image.height / LOOK_BLOCK);
         let (mut wrong, mut blocks) = (0, 0);
-        for block in 0..(image.height / LOOK_BLOCK) * (image.width / LOOK_BLOCK) {
-            let (bx, by) = (block % (image.width / LOOK_BLOCK), block / (image.width / LOOK_BLOCK));
+        for block in 0..columns * rows {
+            let (bx, by) = (block % columns, block / columns);
             let mut sum = [0.0f32; 3];
             let mut usable = true;
             for k in 0..LOOK_BLOCK * LOOK_BLOCK {
