@@ -9,7 +9,7 @@ pub mod lanes;
 mod machine;
 pub mod matrix;
 
-pub use machine::{PRODUCT_WIDTH, add_products, add_quarter_sums, prefetch};
+pub use machine::{Finish, add_quarter_sums, multiply, prefetch};
 
 use bytemuck::{Pod, Zeroable};
 use half::f16;
@@ -19,7 +19,7 @@ use self::floats::Floats;
 /// Samples per tile: three AVX-512 vectors, six AVX2 vectors or twelve NEON vectors.
 ///
 /// A product takes three vectors by four outputs at a time where there are 32 registers: twelve sums, which hide the latency of a fused
-/// multiply-add on two ports. With AVX2's sixteen, too, but there [`add_products`] says which register is for what; elsewhere it takes two by
+/// multiply-add on two ports. With AVX2's sixteen, too, but there [`multiply`] says which register is for what; elsewhere it takes two by
 /// four, since sums that do not fit go through memory.
 pub const TILE: usize = 48;
 

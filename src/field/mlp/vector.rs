@@ -7,7 +7,7 @@ use glam::Vec4;
 use pulp::Simd;
 
 use super::{BLOCK, Layer};
-use crate::simd::{PRODUCT_WIDTH, TILE, add_products, add_quarter_sums, prefetch};
+use crate::simd::{Finish, TILE, add_quarter_sums, multiply, prefetch};
 
 /// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
 pub struct Packed {
@@ -63,7 +63,7 @@ impl Packed {
             let (w, w_again) = w.split_at(layer.fresh() * layer.n_out);
             let dy = &dy[..layer.n_out * TILE];
             let x = &tile[layer.row * TILE..][..layer.fresh() * TILE];
-            let finish = if n > 0 { Finish::Where(S::as_simd_f32s(x).0) } else { Finish::Plain };
+            let finish = if n > 0 { Finish::Where(x) } else { Finish::Plain };
             matmul(simd, w, &[], dy, fresh, finish);
             if layer.again > 0 {
                 matmul(simd, w_again, &[], dy, again, Finish::Plain);
@@ -177,33 +177,24 @@ impl<'a> TileView<'a> {
     }
 }
 
-/// What becomes of a sum before it is written.
-#[derive(Clone, Copy)]
-enum Finish<'a, V> {
-    /// Nothing.
-    Plain,
-    /// Negative ones are 0.
-    Relu,
-    /// 0 except where these rows, of the same place as the output, are positive: the way back through a ReLU.
-    Where(&'a [V]),
-}
-
 /// y = W x + b for one tile, finished; `w` is packed four outputs side by side.
 #[inline(always)]
-fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], finish: Finish<S::f32s>) {
+fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], finish: Finish) {
     let vectors = TILE / S::F32_LANES;
-    // Sums that do not fit the registers would go through memory, unless it is said which register is for what.
-    if S::REGISTER_COUNT < 32 && vectors.is_multiple_of(2) && !exact::<S, 3>() {
+    if cfg!(target_arch = "x86_64") && S::F32_LANES == 8 {
+        multiply(w.as_chunks().0, bias.as_chunks().0, x, finish, y);
+    } else if S::REGISTER_COUNT < 32 && vectors.is_multiple_of(2) {
+        // Sums that do not fit the registers would go through memory.
         matmul_of::<S, 2>(simd, w, bias, x, y, finish);
     } else {
         matmul_of::<S, 3>(simd, w, bias, x, y, finish);
     }
 }
 
-/// Whether `WIDE` vectors side by side are what [`add_products`] multiplies.
+/// Biases of a block of outputs; without any, zeros.
 #[inline(always)]
-fn exact<S: Simd, const WIDE: usize>() -> bool {
-    cfg!(target_arch = "x86_64") && S::F32_LANES == 8 && S::F32_LANES * WIDE == PRODUCT_WIDTH
+fn bias_of(bias: &[f32], block: usize) -> [f32; BLOCK] {
+    bias.as_chunks().0.get(block).copied().unwrap_or_default()
 }
 
 /// [`matmul`], `WIDE` vectors, of which a tile has some multiple, side by side.
@@ -214,33 +205,22 @@ fn matmul_of<S: Simd, const WIDE: usize>(
     bias: &[f32],
     x: &[f32],
     y: &mut [f32],
-    finish: Finish<S::f32s>,
+    finish: Finish,
 ) {
     let groups = TILE / S::F32_LANES / WIDE;
     let n_in = x.len() / TILE;
-    let floats = x;
     let x = S::as_simd_f32s(x).0.as_chunks::<WIDE>().0;
     let y = S::as_mut_simd_f32s(y).0.as_chunks_mut::<WIDE>().0;
-    let zero = simd.splat_f32s(0.0);
     for group in 0..groups {
         for (block, w) in w.chunks_exact(BLOCK * n_in).enumerate() {
-            let mut acc = [[zero; WIDE]; BLOCK];
-            if let Some(b) = bias.get(block * BLOCK..(block + 1) * BLOCK) {
-                for j in 0..BLOCK {
-                    acc[j] = [simd.splat_f32s(b[j]); WIDE];
-                }
+            let mut acc = [[simd.splat_f32s(0.0); WIDE]; BLOCK];
+            for (acc, b) in acc.iter_mut().zip(bias_of(bias, block)) {
+                *acc = [simd.splat_f32s(b); WIDE];
             }
             let at = block * BLOCK * groups + group;
             ask_for(y, at, groups);
             if let Finish::Where(x) = finish {
-                ask_for(x.as_chunks::<WIDE>().0, at, groups);
-            }
-            if exact::<S, WIDE>()
-                && let [sums] = bytemuck::cast_slice_mut(acc.as_flattened_mut())
-            {
-                add_products(w.as_chunks().0, &floats[group * PRODUCT_WIDTH..], sums);
-                finish_rows(simd, &acc, finish, at, groups, y);
-                continue;
+                ask_for(S::as_simd_f32s(x).0.as_chunks::<WIDE>().0, at, groups);
             }
             // Four inputs at a time, since counting takes instructions, too; and without iterators, of which the compiler may
             // leave calls, for which all sums would go through memory.
@@ -282,7 +262,7 @@ fn ask_for<T>(rows: &[T], at: usize, stride: usize) {
 fn finish_rows<S: Simd, const WIDE: usize>(
     simd: S,
     sums: &[[S::f32s; WIDE]; BLOCK],
-    finish: Finish<S::f32s>,
+    finish: Finish,
     at: usize,
     stride: usize,
     out: &mut [[S::f32s; WIDE]],
@@ -303,7 +283,7 @@ fn finish_rows<S: Simd, const WIDE: usize>(
             }
         }
         Finish::Where(x) => {
-            let x = &x.as_chunks::<WIDE>().0[at..][..3 * stride + 1];
+            let x = &S::as_simd_f32s(x).0.as_chunks::<WIDE>().0[at..][..3 * stride + 1];
             for j in 0..BLOCK {
                 for v in 0..WIDE {
                     let positive = simd.greater_than_f32s(x[j * stride][v], zero);

@@ -43,26 +43,46 @@ pub fn add_quarter_sums(rows: &[f32], lanes: usize, out: &mut [[f32; 16]]) {
     }
 }
 
-/// Samples of a tile for which [`add_products`] multiplies at a time.
-pub const PRODUCT_WIDTH: usize = TILE / 2;
+/// What becomes of a sum before it is written.
+#[derive(Clone, Copy)]
+pub enum Finish<'a> {
+    /// Nothing.
+    Plain,
+    /// Negative ones are 0.
+    Relu,
+    /// 0 except where these rows, of the same place as the output, are positive: the way back through a ReLU.
+    Where(&'a [f32]),
+}
 
-/// Adds the sum over inputs k of `w[k][j] x[k * TILE + n]` to `sums[j][n]`, for a number of inputs that four divides, with a
-/// fused multiply-add an input.
+/// y = W x + b for one tile, finished: `w` is `[block][input][4]`, four outputs a block, `x` `[input][TILE]`, `y` `[4 block][TILE]`, and
+/// `bias` `[block][4]` or nothing; a fused multiply-add an input, of which there is a multiple of four. For processors with
+/// vectors of eight numbers and sixteen registers, of which compilers would keep some sums in memory.
 #[inline(always)]
-pub fn add_products(w: &[[f32; 4]], x: &[f32], sums: &mut [[f32; PRODUCT_WIDTH]; 4]) {
+pub fn multiply(w: &[[f32; 4]], bias: &[[f32; 4]], x: &[f32], finish: Finish, y: &mut [f32]) {
+    let (inputs, blocks) = (x.len() / TILE, y.len() / (4 * TILE));
+    assert!(inputs > 0 && inputs.is_multiple_of(4) && w.len() == inputs * blocks);
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx") && is_x86_feature_detected!("fma") {
         // SAFETY: this processor has the instructions.
-        return unsafe { products::add_products(w, x, sums) };
+        return unsafe { products::multiply(w, bias, x, finish, y) };
     }
-    add_products_one_by_one(w, x, sums);
+    multiply_one_by_one(w, bias, x, finish, y);
 }
 
-fn add_products_one_by_one(w: &[[f32; 4]], x: &[f32], sums: &mut [[f32; PRODUCT_WIDTH]; 4]) {
-    for (w, x) in w.iter().zip(x.chunks(TILE)) {
-        for (sums, w) in sums.iter_mut().zip(w) {
-            sums.iter_mut().zip(x).for_each(|(sum, x)| *sum = w.mul_add(*x, *sum));
-        }
+fn multiply_one_by_one(w: &[[f32; 4]], bias: &[[f32; 4]], x: &[f32], finish: Finish, y: &mut [f32]) {
+    let inputs = x.len() / TILE;
+    for (at, y) in y.iter_mut().enumerate() {
+        let (row, n) = (at / TILE, at % TILE);
+        let (block, j) = (row / 4, row % 4);
+        let bias = bias.get(block).map_or(0.0, |b| b[j]);
+        let w = &w[block * inputs..][..inputs];
+        let sum = w.iter().zip(x.chunks_exact(TILE)).fold(bias, |sum, (w, x)| w[j].mul_add(x[n], sum));
+        *y = match finish {
+            Finish::Plain => sum,
+            Finish::Relu => sum.max(0.0),
+            Finish::Where(rows) if rows[at] > 0.0 => sum,
+            Finish::Where(_) => 0.0,
+        };
     }
 }
 
@@ -92,17 +112,20 @@ mod tests {
 
     #[test]
     fn products_are_those_of_one_number_after_the_other() {
-        for inputs in [0, 4, 8, 64] {
+        for (inputs, blocks) in [(4, 1), (8, 3), (64, 2)] {
             let mut rng = Rng::new(inputs as u64, 0, 0);
             let mut number = move || rng.uniform() - 0.5;
-            let w: Vec<[f32; 4]> = (0..inputs).map(|_| std::array::from_fn(|_| number())).collect();
-            for first in [0, PRODUCT_WIDTH] {
-                let x: Vec<f32> = (0..inputs * TILE + first).map(|_| number()).collect();
-                let mut fast = [[0.25; PRODUCT_WIDTH]; 4];
-                let mut slow = fast;
-                add_products(&w, &x[first..], &mut fast);
-                add_products_one_by_one(&w, &x[first..], &mut slow);
-                assert_eq!(fast, slow);
+            let w: Vec<[f32; 4]> = (0..inputs * blocks).map(|_| std::array::from_fn(|_| number())).collect();
+            let bias: Vec<[f32; 4]> = (0..blocks).map(|_| std::array::from_fn(|_| number())).collect();
+            let [x, rows] =
+                [inputs, 4 * blocks].map(|n| (0..n * TILE).map(|_| number()).collect::<Vec<f32>>());
+            for finish in [Finish::Plain, Finish::Relu, Finish::Where(&rows)] {
+                for bias in [&bias[..], &[]] {
+                    let [mut fast, mut slow] = [(); 2].map(|()| vec![2.0; 4 * blocks * TILE]);
+                    multiply(&w, bias, &x, finish, &mut fast);
+                    multiply_one_by_one(&w, bias, &x, finish, &mut slow);
+                    assert_eq!(fast, slow);
+                }
             }
         }
     }

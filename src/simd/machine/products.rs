@@ -1,12 +1,15 @@
 //! Products of small matrices with as many sums as AVX2 has registers for, of which compilers keep some in memory.
 
 use std::arch::asm;
-use std::arch::x86_64::{__m256, _mm256_loadu_ps, _mm256_storeu_ps};
+use std::arch::x86_64::*;
 
-use super::{PRODUCT_WIDTH, TILE};
+use super::{Finish, TILE, prefetch};
 
 /// Numbers of a vector.
 const LANES: usize = 8;
+
+/// Samples of a tile that are multiplied at a time.
+const WIDTH: usize = TILE / 2;
 
 /// Adds to the three sums of output `j` of `{a0}` to `{d2}` its weight of input number `k` times the input's vectors.
 macro_rules! output {
@@ -35,22 +38,45 @@ macro_rules! input {
     };
 }
 
-/// As [`super::add_products`], for a number of inputs that four divides.
+/// As [`super::multiply`], which has asserted that all lengths fit.
+#[target_feature(enable = "avx,fma")]
+pub fn multiply(w: &[[f32; 4]], bias: &[[f32; 4]], x: &[f32], finish: Finish, y: &mut [f32]) {
+    let inputs = x.len() / TILE;
+    for first in [0, WIDTH] {
+        for (block, (w, y)) in w.chunks_exact(inputs).zip(y.chunks_exact_mut(4 * TILE)).enumerate() {
+            let at = block * 4 * TILE + first;
+            // There are more tiles in a chunk than a near cache holds.
+            ask_for(&y[first..]);
+            let finish = match finish {
+                Finish::Where(rows) => Finish::Where(&rows[at..]),
+                other => other,
+            };
+            if let Finish::Where(rows) = finish {
+                ask_for(rows);
+            }
+            products(w, bias.get(block).copied().unwrap_or_default(), &x[first..], finish, &mut y[first..]);
+        }
+    }
+}
+
+/// Asks for the cache lines of four rows.
+#[inline]
+fn ask_for(rows: &[f32]) {
+    for row in rows.chunks(TILE).take(4) {
+        prefetch(&row[0], 0);
+        prefetch(&row[0], 64);
+    }
+}
+
+/// Half a tile of four outputs.
 #[inline]
 #[target_feature(enable = "avx,fma")]
-pub fn add_products(w: &[[f32; 4]], x: &[f32], sums: &mut [[f32; PRODUCT_WIDTH]; 4]) {
-    const { assert!(TILE * size_of::<f32>() == 192 && PRODUCT_WIDTH == 3 * LANES) };
+fn products(w: &[[f32; 4]], bias: [f32; 4], x: &[f32], finish: Finish, y: &mut [f32]) {
+    const { assert!(TILE * size_of::<f32>() == 192 && WIDTH == 3 * LANES) };
     let rounds = w.len() / 4;
-    if rounds == 0 {
-        return;
-    }
-    assert!(x.len() >= (4 * rounds - 1) * TILE + PRODUCT_WIDTH);
-    let [
-        [mut a0, mut a1, mut a2],
-        [mut b0, mut b1, mut b2],
-        [mut c0, mut c1, mut c2],
-        [mut d0, mut d1, mut d2],
-    ] = [load(&sums[0]), load(&sums[1]), load(&sums[2]), load(&sums[3])];
+    assert!(rounds > 0 && x.len() >= (4 * rounds - 1) * TILE + WIDTH);
+    let [mut a0, mut b0, mut c0, mut d0] = bias.map(|b| _mm256_set1_ps(b));
+    let [[mut a1, mut b1, mut c1, mut d1], [mut a2, mut b2, mut c2, mut d2]] = [[a0, b0, c0, d0]; 2];
     // SAFETY: reads four weights of each of four inputs a round, and of each input as many numbers as have been asserted.
     unsafe {
         asm!(
@@ -74,28 +100,42 @@ pub fn add_products(w: &[[f32; 4]], x: &[f32], sums: &mut [[f32; PRODUCT_WIDTH];
             options(readonly, nostack),
         );
     }
-    store([a0, a1, a2], &mut sums[0]);
-    store([b0, b1, b2], &mut sums[1]);
-    store([c0, c1, c2], &mut sums[2]);
-    store([d0, d1, d2], &mut sums[3]);
+    let sums = [[a0, a1, a2], [b0, b1, b2], [c0, c1, c2], [d0, d1, d2]];
+    let zero = _mm256_setzero_ps();
+    // One short path for each way to finish: all sums stay in registers.
+    match finish {
+        Finish::Plain => store(sums, y),
+        Finish::Relu => store(sums.map(|row| row.map(|sum| _mm256_max_ps(sum, zero))), y),
+        Finish::Where(rows) => {
+            let mut kept = sums;
+            for (n, row) in kept.iter_mut().enumerate() {
+                for (sum, x) in row.iter_mut().zip(load(&rows[n * TILE..])) {
+                    *sum = _mm256_and_ps(*sum, _mm256_cmp_ps::<_CMP_GT_OQ>(x, zero));
+                }
+            }
+            store(kept, y);
+        }
+    }
 }
 
 #[inline]
 #[target_feature(enable = "avx")]
-fn load(row: &[f32; PRODUCT_WIDTH]) -> [__m256; 3] {
-    let at = row.as_ptr();
+fn load(row: &[f32]) -> [__m256; 3] {
+    let at = row[..WIDTH].as_ptr();
     // SAFETY: as many floats as are read.
     unsafe { [_mm256_loadu_ps(at), _mm256_loadu_ps(at.add(LANES)), _mm256_loadu_ps(at.add(2 * LANES))] }
 }
 
 #[inline]
 #[target_feature(enable = "avx")]
-fn store(vectors: [__m256; 3], row: &mut [f32; PRODUCT_WIDTH]) {
-    let at = row.as_mut_ptr();
-    // SAFETY: as many floats as are written.
-    unsafe {
-        _mm256_storeu_ps(at, vectors[0]);
-        _mm256_storeu_ps(at.add(LANES), vectors[1]);
-        _mm256_storeu_ps(at.add(2 * LANES), vectors[2]);
+fn store(rows: [[__m256; 3]; 4], y: &mut [f32]) {
+    for (n, row) in rows.into_iter().enumerate() {
+        let at = y[n * TILE..][..WIDTH].as_mut_ptr();
+        // SAFETY: as many floats as are written.
+        unsafe {
+            _mm256_storeu_ps(at, row[0]);
+            _mm256_storeu_ps(at.add(LANES), row[1]);
+            _mm256_storeu_ps(at.add(2 * LANES), row[2]);
+        }
     }
 }
