@@ -290,6 +290,17 @@ impl LevelTask<'_> {
     }
 }
 
+/// What becomes of the activations of a batch's tiles.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tiles {
+    /// Every tile takes the place of the one before it, which stays near the core.
+    Passing,
+    /// All are kept, for the way back or for [`StreamNet::forward`] after [`StreamNet::density`].
+    Kept,
+    /// They are there already, kept by [`StreamNet::density`], whose work is not done again.
+    Known,
+}
+
 /// Activations of one stream's networks over the samples of a chunk.
 #[derive(Default)]
 pub struct StreamActivations {
@@ -322,8 +333,7 @@ impl StreamNet {
         batch.encode(&self.encoding, w.tables);
     }
 
-    /// Evaluates all samples of an encoded `batch`; `code` and `view` give the conditioning of a ray. `known`: what
-    /// [`Self::density`] said of them is used again.
+    /// Evaluates all samples of an encoded `batch`; `code` and `view` give the conditioning of a ray.
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
     pub fn forward<'c, S: Simd>(
@@ -332,26 +342,28 @@ impl StreamNet {
         w: &StreamWeights,
         batch: &StreamBatch,
         activations: &mut StreamActivations,
-        known: bool,
+        tiles: Tiles,
         code: impl Fn(usize) -> &'c [f32],
         view: impl Fn(usize) -> &'c [f32],
         out: &mut StreamSamples,
     ) {
         let unit = Unit::detect();
         let StreamActivations { trunk, head } = activations;
-        let known = known && w.trunk.keeps_tiles();
+        let known = tiles == Tiles::Known && w.trunk.keeps_tiles();
+        let kept = if tiles == Tiles::Passing { 1 } else { batch.pos.len() };
         if !known {
-            self.trunk.reserve(w.trunk, batch.pos.len(), trunk);
+            self.trunk.reserve(w.trunk, kept, trunk);
         }
-        self.head.reserve(w.head, batch.pos.len(), head);
-        for (n, lanes) in batch.sample.chunks(TILE).enumerate() {
+        self.head.reserve(w.head, kept, head);
+        for (tile, lanes) in batch.sample.chunks(TILE).enumerate() {
+            let n = if tiles == Tiles::Passing { 0 } else { tile };
             if !known {
-                self.trunk_forward(simd, &unit, w, batch, n, trunk, n, &code, self.trunk.output());
+                self.trunk_forward(simd, &unit, w, batch, tile, trunk, n, &code, self.trunk.output());
             }
             let geometry = trunk.output(n);
             let (features, rest) = head.input(n).split_at_mut(geometry.len());
             features.copy_from_slice(geometry);
-            condition(rest, self.view, batch.rays(n), &view);
+            condition(rest, self.view, batch.rays(tile), &view);
             self.head.forward(simd, &unit, w.head, head, n);
             let mut sigma = [0.0; TILE];
             self.densities(simd, geometry, &mut sigma);
@@ -372,8 +384,8 @@ impl StreamNet {
         }
     }
 
-    /// Densities alone of all samples of an encoded `batch`, in lane order; colours and uncertainty are not computed. `first`:
-    /// some of the samples, by [`Self::retain`], will go through [`Self::forward`], for which what can be is kept.
+    /// Densities alone of all samples of an encoded `batch`, in lane order; colours and uncertainty are not computed. What can
+    /// be is kept, if that is asked for, so that some of the samples, by [`Self::retain`], can go through [`Self::forward`].
     #[inline(always)]
     #[allow(clippy::too_many_arguments)]
     pub fn density<'c, S: Simd>(
@@ -382,15 +394,15 @@ impl StreamNet {
         w: &StreamWeights,
         batch: &StreamBatch,
         activations: &mut StreamActivations,
-        first: bool,
+        tiles: Tiles,
         code: impl Fn(usize) -> &'c [f32],
         out: &mut [f32],
     ) {
         let unit = Unit::detect();
         let trunk = &mut activations.trunk;
-        let kept = first && w.trunk.keeps_tiles();
-        let (tiles, outputs) = if kept { (batch.pos.len(), self.trunk.output()) } else { (1, 1) };
-        self.trunk.reserve(w.trunk, tiles, trunk);
+        let kept = tiles == Tiles::Kept && w.trunk.keeps_tiles();
+        let (room, outputs) = if kept { (batch.pos.len(), self.trunk.output()) } else { (1, 1) };
+        self.trunk.reserve(w.trunk, room, trunk);
         for (tile, out) in out[..batch.len()].chunks_mut(TILE).enumerate() {
             let n = if kept { tile } else { 0 };
             self.trunk_forward(simd, &unit, w, batch, tile, trunk, n, &code, outputs);
@@ -644,12 +656,12 @@ mod tests {
         }
     }
 
-    /// What a stream says of the samples `keep` of a batch, first asked for the density of all of them or not.
+    /// What a stream says of the samples `keep` of a batch, first asked for the density of all of them if their tiles are known.
     struct Said<'a> {
         field: &'a Field,
         precision: Precision,
         keep: fn(usize) -> bool,
-        first: bool,
+        tiles: Tiles,
     }
 
     impl pulp::WithSimd for Said<'_> {
@@ -657,7 +669,8 @@ mod tests {
 
         #[inline(always)]
         fn with_simd<S: Simd>(self, simd: S) -> StreamSamples {
-            let Self { field, precision, keep, first } = self;
+            let Self { field, precision, keep, tiles } = self;
+            let first = tiles == Tiles::Known;
             let (net, r) =
                 (field.net(Stream::Dynamic).expect("all streams are on"), &field.layout.streams[1]);
             let [trunk, head] = [(&net.trunk, &r.trunk), (&net.head, &r.head)]
@@ -669,10 +682,10 @@ mod tests {
             let mut batch = encoded((0..COUNT).filter(|n| first || keep(*n)), false);
             if first {
                 let mut sigma = vec![0.0; COUNT];
-                net.density(simd, &w, &batch, &mut activations, true, code, &mut sigma);
+                net.density(simd, &w, &batch, &mut activations, Tiles::Kept, code, &mut sigma);
                 net.retain(&w, &mut batch, &mut activations, keep);
             }
-            net.forward(simd, &w, &batch, &mut activations, first, code, view, &mut out);
+            net.forward(simd, &w, &batch, &mut activations, tiles, code, view, &mut out);
             out
         }
     }
@@ -681,19 +694,20 @@ mod tests {
     const COUNT: usize = 200;
 
     #[test]
-    fn what_is_known_by_its_density_says_the_same() {
+    fn what_is_known_or_not_kept_says_the_same() {
         let mut field = Field::zeros(testing::shape(&testing::config_of(EncodingKind::Hash)));
         let mut rng = Rng::new(4, 0, 0);
         field.weights.iter_mut().for_each(|w| *w = rng.uniform() - 0.5);
         let keeps: [fn(usize) -> bool; 4] = [|_| false, |n| n % 90 == 7, |n| n % 3 > 0, |_| true];
         for precision in [Precision::F32, Precision::Bf16] {
             for keep in keeps {
-                let said = |first| {
-                    let out = pulp::Arch::new().dispatch(Said { field: &field, precision, keep, first });
+                let said = |tiles| {
+                    let out = pulp::Arch::new().dispatch(Said { field: &field, precision, keep, tiles });
                     let StreamSamples { sigma, rgb: [r, g, b], beta } = out;
                     [sigma, r, g, b, beta].map(|column| column.to_vec())
                 };
-                assert_eq!(said(true), said(false));
+                assert_eq!(said(Tiles::Known), said(Tiles::Kept));
+                assert_eq!(said(Tiles::Passing), said(Tiles::Kept));
             }
         }
     }

@@ -10,7 +10,7 @@ use super::density_grid::{DensityGrid, STRIDE};
 use super::rays::{Ray, View};
 use super::sampler::{Lanes, RayLanes, Sampler, Sampling, Steer};
 use crate::field::mlp::{Packed, Precision};
-use crate::field::stream::{StreamActivations, StreamBatch, StreamSamples, StreamWeights};
+use crate::field::stream::{StreamActivations, StreamBatch, StreamSamples, StreamWeights, Tiles};
 use crate::field::{Field, Stream, VIEW, view_encoding};
 use crate::simd::AlignedVec;
 use crate::simd::floats::{Column, ColumnMut};
@@ -268,7 +268,7 @@ pub struct Placed {
 }
 
 impl Chunk {
-    /// Traces `inputs` and fills all buffers.
+    /// Traces `inputs` and fills all buffers but those for the way back.
     #[inline(always)]
     pub fn forward<S: Simd>(
         &mut self,
@@ -281,7 +281,9 @@ impl Chunk {
     ) {
         self.place(tracer, model, views, inputs, sampling);
         self.encode(model);
-        self.evaluate(simd, tracer, model, Faint::default());
+        self.find_colours(simd, tracer, model, Tiles::Passing);
+        self.weights.find(simd, &self.intervals);
+        self.composite(simd);
     }
 
     /// As [`Self::forward`], but densities and weights alone: colours and uncertainty are not computed.
@@ -297,20 +299,20 @@ impl Chunk {
     ) {
         self.place(tracer, model, views, inputs, sampling);
         self.encode(model);
-        self.find_densities(simd, tracer, model, false);
+        self.find_densities(simd, tracer, model, Tiles::Passing);
         self.weights.find(simd, &self.intervals);
     }
 
-    /// Densities at all samples of the batches, and nothing else of the streams unless their colours are asked for later.
+    /// Densities at all samples of the batches, and nothing else of the streams.
     #[inline(always)]
-    fn find_densities<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, colours: bool) {
+    fn find_densities<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, tiles: Tiles) {
         let Self { codes, intervals, batches, .. } = self;
         let Tracer { sigma, activations, .. } = tracer;
         for s in 0..3 {
             let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
             sigma.resize(batches[s].len(), 0.0);
             let code = |r: usize| &codes[s][r * net.code..];
-            net.density(simd, &w, &batches[s], &mut activations[s], colours, code, sigma);
+            net.density(simd, &w, &batches[s], &mut activations[s], tiles, code, sigma);
             for (&k, sigma) in batches[s].sample.iter().zip(&*sigma) {
                 intervals.sigma[s][k as usize] = *sigma;
             }
@@ -332,14 +334,14 @@ impl Chunk {
     /// colour and uncertainty count as zero there.
     #[inline(always)]
     pub fn evaluate<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, faint: Faint) {
-        let first = faint.share > 0.0;
-        if first {
-            self.find_densities(simd, tracer, model, true);
+        let tiles = if faint.share > 0.0 { Tiles::Known } else { Tiles::Kept };
+        if tiles == Tiles::Known {
+            self.find_densities(simd, tracer, model, Tiles::Kept);
             self.weights.find(simd, &self.intervals);
             self.drop_faint(tracer, model, faint);
         }
-        self.find_colours(simd, tracer, model, first);
-        if !first {
+        self.find_colours(simd, tracer, model, tiles);
+        if tiles == Tiles::Kept {
             self.weights.find(simd, &self.intervals);
         }
         self.composite(simd);
@@ -356,9 +358,9 @@ impl Chunk {
         }
     }
 
-    /// What the streams say at the samples of their batches; `known`: after [`Self::find_densities`] for colours.
+    /// What the streams say at the samples of their batches.
     #[inline(always)]
-    fn find_colours<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, known: bool) {
+    fn find_colours<S: Simd>(&mut self, simd: S, tracer: &mut Tracer, model: &Model, tiles: Tiles) {
         let Self { codes, rays, intervals, batches, samples, .. } = self;
         for s in 0..3 {
             let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
@@ -369,8 +371,8 @@ impl Chunk {
             let code = |r: usize| &codes[s][r * net.code..];
             let view = |r: usize| &rays[r].view[..];
             let activations = &mut tracer.activations[s];
-            net.forward(simd, &w, &batches[s], activations, known, code, view, &mut samples[s]);
-            if !known {
+            net.forward(simd, &w, &batches[s], activations, tiles, code, view, &mut samples[s]);
+            if tiles != Tiles::Known {
                 for &k in &batches[s].sample {
                     intervals.sigma[s][k as usize] = samples[s].sigma[k as usize];
                 }

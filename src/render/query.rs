@@ -4,7 +4,7 @@ use glam::Vec3;
 use pulp::{Simd, WithSimd};
 
 use super::forward::Model;
-use crate::field::stream::{StreamActivations, StreamBatch, StreamNet, StreamSamples, StreamWeights};
+use crate::field::stream::{StreamActivations, StreamBatch, StreamNet, StreamSamples, StreamWeights, Tiles};
 use crate::field::{Stream, view_encoding};
 
 /// One stream of a model at one time.
@@ -92,7 +92,15 @@ impl WithSimd for DensityPass<'_> {
         let code = |_: usize| &self.query.code[..];
         let mut activations = StreamActivations::default();
         self.query.net.encode(&self.weights, self.batch);
-        self.query.net.density(simd, &self.weights, self.batch, &mut activations, false, code, self.out);
+        self.query.net.density(
+            simd,
+            &self.weights,
+            self.batch,
+            &mut activations,
+            Tiles::Passing,
+            code,
+            self.out,
+        );
     }
 }
 
@@ -119,7 +127,7 @@ impl WithSimd for ColourPass<'_> {
             &self.weights,
             self.batch,
             &mut activations,
-            false,
+            Tiles::Passing,
             code,
             view,
             self.out,

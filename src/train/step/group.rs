@@ -4,7 +4,7 @@ use glam::{Vec2, Vec3};
 use pulp::Simd;
 
 use super::{CHUNK_RAYS, Companion, StepPlan};
-use crate::field::stream::{StreamActivations, StreamBatch};
+use crate::field::stream::{StreamActivations, StreamBatch, Tiles};
 use crate::render::density_grid::DensityGrid;
 use crate::render::forward::{Chunk, Faint, Model, RayInput, Tracer};
 use crate::render::rays::View;
@@ -372,6 +372,6 @@ impl Refresh {
         let (Some(net), Some(w)) = (&context.model.field.nets[s], context.model.weights(s)) else { return };
         sigma.resize(batch.len(), 0.0);
         let code = |k: usize| &codes[k * net.code..];
-        net.density(simd, &w, batch, &mut tracer.activations[s], false, code, sigma);
+        net.density(simd, &w, batch, &mut tracer.activations[s], Tiles::Passing, code, sigma);
     }
 }
