@@ -5,7 +5,7 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::forward::{Chunk, Model, RayInput, Tracer};
-use super::rays::{View, pixel_directions};
+use super::rays::{View, pixel_direction};
 use super::sampler::Sampling;
 use crate::scene::Frame;
 
@@ -32,7 +32,6 @@ pub fn render(model: &Model, frame: &Frame, sampling: &Sampling, stride: u32) ->
     let field = model.field;
     let view = View::new(field, frame);
     let camera = &frame.camera;
-    let directions = pixel_directions(camera);
     let (width, height) = (camera.width.div_ceil(stride), camera.height.div_ceil(stride));
     let mut exposure = [0.0; 6];
     field.exposure.evaluate(&field.weights[field.layout.exposure.clone()], view.knots, &mut exposure);
@@ -40,7 +39,7 @@ pub fn render(model: &Model, frame: &Frame, sampling: &Sampling, stride: u32) ->
         .flat_map(|y| (0..width).map(move |x| (x * stride, y * stride)))
         .map(|(x, y)| RayInput {
             view: 0,
-            dir_cam: directions[(y * camera.width + x) as usize],
+            dir_cam: pixel_direction(camera, x, y),
             uv: Vec2::new((x as f32 + 0.5) / camera.width as f32, (y as f32 + 0.5) / camera.height as f32),
             jitter: 0.5,
         })

@@ -9,15 +9,18 @@ use crate::scene::{Camera, Frame};
 /// Unit directions in camera axes through every pixel centre of a camera, `[height * width]`.
 pub type PixelDirections = Vec<Vec3>;
 
-/// Directions of all pixels; the lens is undone once here and nowhere else.
+/// Directions of all pixels.
 pub fn pixel_directions(camera: &Camera) -> PixelDirections {
     (0..camera.height)
         .flat_map(|y| (0..camera.width).map(move |x| (x, y)))
-        .map(|(x, y)| {
-            let uv = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-            camera.unproject(uv).normalize().as_vec3()
-        })
+        .map(|(x, y)| pixel_direction(camera, x, y))
         .collect()
+}
+
+/// Unit direction in camera axes through the centre of a pixel; the lens is undone here and nowhere else.
+pub fn pixel_direction(camera: &Camera, x: u32, y: u32) -> Vec3 {
+    let uv = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+    camera.unproject(uv).normalize().as_vec3()
 }
 
 /// A frame's pose in units, with the refinement that training has found for its time.

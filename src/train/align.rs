@@ -70,8 +70,9 @@ pub struct Correction {
 /// Registers all frames of `pixels` to the field. Deterministic, whatever the number of threads.
 pub fn align(model: &Model, pixels: &PixelSet, sampling: &Sampling) -> Correction {
     let field = model.field;
+    let frames = (0..pixels.frames.len()).into_par_iter();
     let mut frames: Vec<Registration> =
-        (0..pixels.frames.len()).map(|n| Registration::new(model, pixels, n, sampling)).collect();
+        frames.map(|n| Registration::new(model, pixels, n, sampling)).collect();
     let given = |k: usize| f64::from(field.weights[field.layout.rig.start + 6 + k]);
     let mut lens = [0.0; SHARED];
     for _ in 0..ITERATIONS {

@@ -50,6 +50,11 @@ impl TrainConfig {
         }
     }
 
+    /// Where samples go when training looks at whole frames, for which as many do as it learns from.
+    pub fn look_sampling(&self) -> Sampling {
+        Sampling { count: self.samples, ..self.render_sampling() }
+    }
+
     /// Where samples go when a trained field is rendered.
     pub fn render_sampling(&self) -> Sampling {
         Sampling {

@@ -315,7 +315,7 @@ impl Trainer {
             return None;
         }
         let model = Model::new(&self.trained.field, &self.trained.grids, self.streams);
-        let sampling = self.config.train.render_sampling();
+        let sampling = self.config.train.look_sampling();
         let pixels: usize = self.test.images.iter().map(Vec::len).sum();
         let stride = (pixels as f64 / TEST_PIXELS).sqrt().ceil() as u32;
         // So few pixels of each that a frame is one piece of work.

@@ -6,7 +6,6 @@ use super::Trainer;
 use crate::config::Config;
 use crate::field::Stream;
 use crate::render::forward::Model;
-use crate::render::sampler::Sampling;
 use crate::stereo::Search;
 use crate::train::align;
 use crate::train::checkpoint::Trained;
@@ -25,8 +24,7 @@ impl Trainer {
     /// Registers all training frames to what the field shows from where they are.
     pub(super) fn align(&mut self) {
         let model = Model::new(&self.trained.field, &self.trained.grids, self.streams);
-        let sampling = Sampling { count: self.config.train.samples, ..self.config.train.render_sampling() };
-        let correction = align::align(&model, &self.pixels, &sampling);
+        let correction = align::align(&model, &self.pixels, &self.config.train.look_sampling());
         correction.apply(&mut self.trained.field);
         let a = correction.report;
         tracing::info!(a.frames, a.rotation, a.translation, lens = ?a.lens, "frames aligned");

@@ -66,7 +66,7 @@ impl Trainer {
     /// Numbers of blocks of frame `n`: those whose mean colour `model` gets wrong, and all; without those that a mask takes pixels away from.
     fn wrong_blocks(&self, model: &Model, pixels: &PixelSet, n: usize) -> (usize, usize) {
         let frame = &pixels.frames[n];
-        let image = render(model, frame, &self.config.train.render_sampling(), LOOK_STRIDE);
+        let image = render(model, frame, &self.config.train.look_sampling(), LOOK_STRIDE);
         let (columns, rows) = (image.width / LOOK_BLOCK, image.height / LOOK_BLOCK);
         let (mut wrong, mut blocks) = (0, 0);
         for block in 0..columns * rows {
