@@ -86,7 +86,7 @@ impl Default for TrainConfig {
             rays: 4096,
             patch: 4,
             samples: 20,
-            render_samples: 48,
+            render_samples: 32,
             streams: StreamChoice::Auto,
             static_until: 0.15,
             novelty: 0.3,
