@@ -80,6 +80,7 @@ impl Config {
                 (config.train.steps, config.train.rays, config.train.samples) = (1400, 2048, 12);
                 // An alignment takes as long as a hundred of its steps.
                 config.train.align_at = vec![0.17, 0.3, 0.45, 0.6];
+                config.train.still_sharpness = 2.0 * config.train.sharpness;
             }
             Preset::Standard => {}
             Preset::Fine => config.train.steps *= 5,
@@ -163,6 +164,7 @@ impl Config {
             ("train.pose_rate", t.pose_rate),
             ("train.rig_rate", t.rig_rate),
             ("train.sharpness", t.sharpness),
+            ("train.still_sharpness", t.still_sharpness),
             ("loss.transient", l.transient),
             ("loss.transient_opacity", l.transient_opacity[0]),
             ("loss.transient_opacity", l.transient_opacity[1]),

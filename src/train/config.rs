@@ -66,6 +66,9 @@ pub struct TrainConfig {
     pub grid_rate: f32,
     /// The density grids' densities times this place the samples; below 1 looks behind what may be fog.
     pub sharpness: f32,
+    /// The same for training once it is known that nothing moves, so that nothing is to be found behind what stands. Twice as
+    /// sharp is better for pictures of a short training, and worse for the surface of a long one.
+    pub still_sharpness: f32,
     /// Fraction of the schedule after which a stream is not evaluated where its grid is empty.
     pub skip_from: f64,
     /// Share of its pixel's light below which nothing is learned from what a stream is at a sample, nor its colour looked at,
@@ -104,6 +107,7 @@ impl Default for TrainConfig {
             grid_cells: 128.0,
             grid_rate: 0.05,
             sharpness: 0.3,
+            still_sharpness: 0.3,
             skip_from: 0.1,
             faint: 1e-4,
             explore: [0.5, 0.1],

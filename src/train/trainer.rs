@@ -294,6 +294,9 @@ impl Trainer {
         progress.step += 1;
         let mut plan =
             self.config.train.plan(self.config.field.encoding, progress.step, fraction, self.streams);
+        if progress.streams_settled && self.streams == [true, false, false] {
+            plan.sampling.sharpness = self.config.train.still_sharpness;
+        }
         if progress.trusts_poses {
             (plan.pose_rate, plan.rig_rate) = (0.0, 0.0);
         }
