@@ -89,18 +89,11 @@ impl WithSimd for DensityPass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let code = |_: usize| &self.query.code[..];
+        let Self { query, weights, batch, out } = self;
+        let code = |_: usize| &query.code[..];
         let mut activations = StreamActivations::default();
-        self.query.net.encode(&self.weights, self.batch);
-        self.query.net.density(
-            simd,
-            &self.weights,
-            self.batch,
-            &mut activations,
-            Tiles::Passing,
-            code,
-            self.out,
-        );
+        query.net.encode(&weights, batch);
+        query.net.density(simd, &weights, batch, &mut activations, Tiles::Passing, code, out);
     }
 }
 
@@ -117,20 +110,11 @@ impl WithSimd for ColourPass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let code = |_: usize| &self.query.code[..];
-        let views = self.views;
+        let Self { query, weights, batch, views, out } = self;
+        let code = |_: usize| &query.code[..];
         let view = |n: usize| &views[n][..];
         let mut activations = StreamActivations::default();
-        self.query.net.encode(&self.weights, self.batch);
-        self.query.net.forward(
-            simd,
-            &self.weights,
-            self.batch,
-            &mut activations,
-            Tiles::Passing,
-            code,
-            view,
-            self.out,
-        );
+        query.net.encode(&weights, batch);
+        query.net.forward(simd, &weights, batch, &mut activations, Tiles::Passing, code, view, out);
     }
 }

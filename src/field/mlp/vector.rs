@@ -7,7 +7,7 @@ use glam::Vec4;
 use pulp::Simd;
 
 use super::{BLOCK, Layer};
-use crate::simd::{Finish, TILE, add_quarter_sums, multiply, prefetch};
+use crate::simd::{Finish, TILE, add_quarter_sums, multiply, prefetch_rows};
 
 /// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
 pub struct Packed {
@@ -218,9 +218,10 @@ fn matmul_of<S: Simd, const WIDE: usize>(
                 *acc = [simd.splat_f32s(b); WIDE];
             }
             let at = block * BLOCK * groups + group;
-            ask_for(y, at, groups);
+            // There are more tiles in a chunk than a near cache holds.
+            prefetch_rows(y, at, groups);
             if let Finish::Where(x) = finish {
-                ask_for(S::as_simd_f32s(x).0.as_chunks::<WIDE>().0, at, groups);
+                prefetch_rows(S::as_simd_f32s(x).0.as_chunks::<WIDE>().0, at, groups);
             }
             // Four inputs at a time, since counting takes instructions, too; and without iterators, of which the compiler may
             // leave calls, for which all sums would go through memory.
@@ -239,18 +240,6 @@ fn matmul_of<S: Simd, const WIDE: usize>(
                 from += BLOCK * groups;
             }
             finish_rows(simd, &acc, finish, at, groups, y);
-        }
-    }
-}
-
-/// Asks for what [`finish_rows`] will read or write: there are more tiles in a chunk than a near cache holds.
-#[inline(always)]
-fn ask_for<T>(rows: &[T], at: usize, stride: usize) {
-    const LINE: usize = 64;
-    let rows = &rows[at..][..3 * stride + 1];
-    for j in 0..BLOCK {
-        for line in 0..size_of::<T>().div_ceil(LINE) {
-            prefetch(&rows[j * stride], line * LINE);
         }
     }
 }

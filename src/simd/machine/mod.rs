@@ -26,6 +26,18 @@ pub fn prefetch<T>(value: &T, bytes: usize) {
     let _ = (value, bytes);
 }
 
+/// Asks for all cache lines of `rows[at]` and the three that follow it every `stride`.
+#[inline(always)]
+pub fn prefetch_rows<T>(rows: &[T], at: usize, stride: usize) {
+    const LINE: usize = 64;
+    let rows = &rows[at..][..3 * stride + 1];
+    for j in 0..4 {
+        for line in 0..size_of::<T>().div_ceil(LINE) {
+            prefetch(&rows[j * stride], line * LINE);
+        }
+    }
+}
+
 /// Adds the sum of each of four rows of `lanes` numbers to every fourth number of `out`, and so on for the next four: how it is
 /// divided among them depends on the machine.
 #[inline(always)]

@@ -3,7 +3,7 @@
 use std::arch::asm;
 use std::arch::x86_64::*;
 
-use super::{Finish, TILE, prefetch};
+use super::{Finish, TILE, prefetch_rows};
 
 /// Numbers of a vector.
 const LANES: usize = 8;
@@ -46,25 +46,16 @@ pub fn multiply(w: &[[f32; 4]], bias: &[[f32; 4]], x: &[f32], finish: Finish, y:
         for (block, (w, y)) in w.chunks_exact(inputs).zip(y.chunks_exact_mut(4 * TILE)).enumerate() {
             let at = block * 4 * TILE + first;
             // There are more tiles in a chunk than a near cache holds.
-            ask_for(&y[first..]);
+            prefetch_rows::<[f32; WIDTH]>(y[first..].as_chunks().0, 0, TILE / WIDTH);
             let finish = match finish {
                 Finish::Where(rows) => Finish::Where(&rows[at..]),
                 other => other,
             };
             if let Finish::Where(rows) = finish {
-                ask_for(rows);
+                prefetch_rows::<[f32; WIDTH]>(rows.as_chunks().0, 0, TILE / WIDTH);
             }
             products(w, bias.get(block).copied().unwrap_or_default(), &x[first..], finish, &mut y[first..]);
         }
-    }
-}
-
-/// Asks for the cache lines of four rows.
-#[inline]
-fn ask_for(rows: &[f32]) {
-    for row in rows.chunks(TILE).take(4) {
-        prefetch(&row[0], 0);
-        prefetch(&row[0], 64);
     }
 }
 
