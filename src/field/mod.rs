@@ -3,6 +3,7 @@
 //! Inside, lengths are in *units*: world coordinates minus the box's smallest corner, divided by the box's longest
 //! side, so that the box is `[0, extent]` with `max(extent) == 1` whatever the scene's own size and place.
 
+pub mod batch;
 pub mod codes;
 pub mod config;
 pub mod encoding;

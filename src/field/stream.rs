@@ -5,15 +5,15 @@
 
 use std::ops::Range;
 
-use glam::{Mat4, Vec3};
+use glam::Vec3;
 use pulp::Simd;
 
+use super::batch::{StreamBatch, transposed};
 use super::config::Widths;
-use super::encoding::{Encoding, Level};
-use super::hashgrid::{AXES, Around, FEATURES, Points, Row, TIME};
+use super::encoding::Encoding;
+use super::hashgrid::{FEATURES, Row};
 use super::mlp::{Activations, Mlp, Packed};
 use crate::simd::floats::{Column, ColumnMut};
-use crate::simd::lanes::{self, Layout};
 use crate::simd::matrix::Unit;
 use crate::simd::{AlignedVec, TILE};
 
@@ -77,216 +77,6 @@ impl StreamSamples {
     /// Room for `n` samples; what is there already is left.
     pub fn reserve(&mut self, n: usize) {
         self.columns().for_each(|column| column.reserve_len(n));
-    }
-}
-
-/// Four rows of four numbers as columns.
-#[inline(always)]
-fn transposed([a, b, c, d]: [Row; FEATURES]) -> [Row; FEATURES] {
-    let columns = Mat4::from_cols(a, b, c, d).transpose();
-    [columns.x_axis, columns.y_axis, columns.z_axis, columns.w_axis]
-}
-
-/// What one level says about a batch's samples; after the way back, the gradient with respect to it.
-#[derive(Default)]
-pub struct LevelRows {
-    /// A row a lane, whole tiles; behind them is what an earlier, larger batch has left.
-    pub rows: Vec<Row>,
-    /// Derivatives by x, y and z of the lanes, likewise, where the batch asks for them.
-    slopes: Vec<[Row; 3]>,
-}
-
-impl LevelRows {
-    /// Writes the features of tile `tile` to `out`, a row of lanes a feature, as networks read them.
-    #[inline(always)]
-    pub fn read_tile(&self, tile: usize, out: &mut [f32]) {
-        let (rows, _) = self.rows[tile * TILE..][..TILE].as_chunks::<FEATURES>();
-        for (n, rows) in rows.iter().enumerate() {
-            let columns = transposed(*rows);
-            for k in 0..FEATURES {
-                out[k * TILE + n * FEATURES..][..FEATURES].copy_from_slice(&columns[k].to_array());
-            }
-        }
-    }
-
-    /// Replaces the features of tile `tile` by the gradient `g` with respect to them, in the order of
-    /// [`Self::read_tile`].
-    #[inline(always)]
-    pub fn write_tile(&mut self, tile: usize, g: &[f32]) {
-        let (rows, _) = self.rows[tile * TILE..][..TILE].as_chunks_mut::<FEATURES>();
-        for (n, rows) in rows.iter_mut().enumerate() {
-            let column = |k: usize| Row::from_slice(&g[k * TILE + n * FEATURES..][..FEATURES]);
-            *rows = transposed([column(0), column(1), column(2), column(3)]);
-        }
-    }
-}
-
-/// The samples of a chunk at which one stream is evaluated, and their encoding.
-#[derive(Default)]
-pub struct StreamBatch {
-    /// Which sample of the chunk each lane is.
-    pub sample: Vec<u32>,
-    /// Which ray each lane belongs to; lanes of a ray follow one another and share its code and view.
-    ray: Vec<u32>,
-    /// Positions, tile by tile.
-    pos: Vec<Points>,
-    /// The encoding, level by level.
-    pub levels: Vec<LevelRows>,
-    /// Whether the gradient with respect to the positions will be asked for.
-    pub slopes: bool,
-    /// Lanes that [`Self::retain`] leaves.
-    kept: Vec<u32>,
-}
-
-/// Moves what stands at the places `kept`, in increasing order, of `values` to their front.
-#[inline(always)]
-fn compact<T: Copy>(values: &mut [T], kept: &[u32]) {
-    for (to, from) in kept.iter().enumerate() {
-        values[to] = values[*from as usize];
-    }
-}
-
-impl StreamBatch {
-    /// Forgets all samples.
-    pub fn clear(&mut self) {
-        self.sample.clear();
-        self.ray.clear();
-        self.pos.clear();
-    }
-
-    /// Adds sample number `sample` of the chunk, of ray number `ray`, at `p` and `time` (0–1 over the video).
-    #[inline(always)]
-    pub fn push(&mut self, sample: usize, ray: usize, p: Vec3, time: f32) {
-        let lane = self.sample.len() % TILE;
-        if lane == 0 {
-            self.pos.push([[0.5; TILE]; AXES]);
-        }
-        let tile = self.pos.len() - 1;
-        for axis in 0..3 {
-            self.pos[tile][axis][lane] = p[axis];
-        }
-        self.pos[tile][TIME][lane] = time;
-        self.sample.push(sample as u32);
-        self.ray.push(ray as u32);
-    }
-
-    /// Leaves the samples of whose number in the chunk `keep` is true, encoded as they are if they are `encoded`.
-    #[inline(always)]
-    fn retain(&mut self, keep: impl Fn(usize) -> bool, encoded: bool) {
-        let Self { sample, ray, pos, levels, slopes, kept } = self;
-        kept.clear();
-        kept.extend((0..sample.len() as u32).filter(|lane| keep(sample[*lane as usize] as usize)));
-        let tiles = kept.len().div_ceil(TILE);
-        for numbers in [sample, ray] {
-            compact(numbers, kept);
-            numbers.truncate(kept.len());
-        }
-        let layout = Layout { rows: AXES, stride: AXES * TILE };
-        lanes::keep(pos.as_flattened_mut().as_flattened_mut(), layout, kept);
-        pos.truncate(tiles);
-        for level in levels {
-            if encoded {
-                compact(&mut level.rows, kept);
-                level.rows[kept.len()..tiles * TILE].fill(Row::ZERO);
-            }
-            if *slopes {
-                compact(&mut level.slopes, kept);
-            }
-        }
-    }
-
-    /// Number of samples.
-    pub fn len(&self) -> usize {
-        self.sample.len()
-    }
-
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.sample.is_empty()
-    }
-
-    /// Positions tile by tile.
-    pub fn tiles(&self) -> &[Points] {
-        &self.pos
-    }
-
-    /// Rays of the lanes of tile `n`.
-    fn rays(&self, n: usize) -> &[u32] {
-        &self.ray[n * TILE..self.len().min((n + 1) * TILE)]
-    }
-
-    /// Number in the chunk and position of every sample.
-    #[inline(always)]
-    pub fn points(&self) -> impl Iterator<Item = (usize, Vec3)> + '_ {
-        let at = |n: usize| Vec3::from_array([0, 1, 2].map(|axis| self.pos[n / TILE][axis][n % TILE]));
-        self.sample.iter().enumerate().map(move |(n, s)| (*s as usize, at(n)))
-    }
-
-    /// Encodes all samples.
-    #[inline(always)]
-    pub fn encode(&mut self, encoding: &Encoding, tables: &[Vec<Row>]) {
-        let mut around = Around::default();
-        for task in self.tasks(encoding, tables) {
-            task.run(&mut around);
-        }
-    }
-
-    /// The encoding to be made of the samples, level by level: see [`LevelTask::run`].
-    pub fn tasks<'a>(&'a mut self, encoding: &'a Encoding, tables: &'a [Vec<Row>]) -> Vec<LevelTask<'a>> {
-        let Self { sample, pos, levels, slopes, .. } = self;
-        levels.resize_with(encoding.levels.len(), LevelRows::default);
-        let parts = encoding.levels.iter().zip(tables).zip(levels);
-        parts
-            .map(|((level, table), out)| LevelTask {
-                level,
-                table,
-                pos,
-                lanes: sample.len(),
-                slopes: *slopes,
-                out,
-            })
-            .collect()
-    }
-}
-
-/// The encoding of one batch on one level.
-///
-/// Whoever has many batches does one level of all of them before the next: a level's table fits a core's L2, all of
-/// them together do not.
-pub struct LevelTask<'a> {
-    level: &'a Level,
-    table: &'a [Row],
-    pos: &'a [Points],
-    lanes: usize,
-    slopes: bool,
-    out: &'a mut LevelRows,
-}
-
-impl LevelTask<'_> {
-    /// Rows that it looks up, or points where there are none.
-    pub fn cost(&self) -> usize {
-        self.lanes * self.level.corners().max(1)
-    }
-
-    /// Looks up and interpolates.
-    #[inline(always)]
-    pub fn run(self, around: &mut Around) {
-        let Self { level, table, pos, lanes, slopes, out } = self;
-        let wanted = pos.len() * TILE;
-        // What an earlier, larger batch has left behind is of no one's concern.
-        if out.rows.len() < wanted {
-            out.rows.resize(wanted, Row::ZERO);
-        }
-        out.rows[lanes..wanted].fill(Row::ZERO);
-        let rows = &mut out.rows[..lanes];
-        if slopes {
-            if out.slopes.len() < wanted {
-                out.slopes.resize(wanted, [Row::ZERO; 3]);
-            }
-            level.encode_with_slopes(table, pos, rows, &mut out.slopes, around);
-        } else {
-            level.encode(table, pos, rows, around);
-        }
     }
 }
 
@@ -611,50 +401,11 @@ pub struct StreamRanges {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::field::batch::tests::encoded;
     use crate::field::mlp::Precision;
     use crate::field::{EncodingKind, Field, Stream};
     use crate::rng::Rng;
     use crate::train::testing;
-
-    /// Samples with the given numbers, five to a ray, encoded by a field of random tables.
-    fn encoded(numbers: impl Iterator<Item = usize>, slopes: bool) -> StreamBatch {
-        let mut field = Field::zeros(testing::shape(&testing::config_of(EncodingKind::Hash)));
-        let mut rng = Rng::new(1, 0, 0);
-        for row in field.tables.iter_mut().flatten().flatten() {
-            *row = Row::new(rng.uniform(), rng.uniform(), rng.uniform(), rng.uniform());
-        }
-        let mut batch = StreamBatch { slopes, ..StreamBatch::default() };
-        for n in numbers {
-            let mut rng = Rng::new(2, n as u64, 0);
-            let p = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform());
-            batch.push(n, n / 5, p, rng.uniform());
-        }
-        let net = field.net(Stream::Dynamic).expect("all streams are on");
-        batch.encode(&net.encoding, &field.tables[Stream::Dynamic as usize]);
-        batch
-    }
-
-    #[test]
-    fn what_is_retained_is_as_if_there_had_been_nothing_else() {
-        // None, within a tile, several tiles, all.
-        for every in [1000, 90, 3, 1] {
-            for slopes in [false, true] {
-                let keep = |n: usize| n % every == every - 1;
-                let mut batch = encoded(0..200, slopes);
-                batch.retain(keep, true);
-                let alone = encoded((0..200).filter(|n| keep(*n)), slopes);
-                assert_eq!((&batch.sample, &batch.ray), (&alone.sample, &alone.ray));
-                assert_eq!(batch.pos.len(), alone.pos.len());
-                assert!(batch.points().eq(alone.points()));
-                for (a, b) in batch.levels.iter().zip(&alone.levels) {
-                    let rows = batch.pos.len() * TILE;
-                    assert_eq!(a.rows[..rows], b.rows[..rows]);
-                    let lanes = if slopes { batch.len() } else { 0 };
-                    assert_eq!(a.slopes[..lanes], b.slopes[..lanes]);
-                }
-            }
-        }
-    }
 
     /// What a stream says of the samples `keep` of a batch, first asked for the density of all of them if their tiles are known.
     struct Said<'a> {

@@ -4,7 +4,8 @@ use glam::Vec3;
 use pulp::{Simd, WithSimd};
 
 use super::forward::Model;
-use crate::field::stream::{StreamActivations, StreamBatch, StreamNet, StreamSamples, StreamWeights, Tiles};
+use crate::field::batch::StreamBatch;
+use crate::field::stream::{StreamActivations, StreamNet, StreamSamples, StreamWeights, Tiles};
 use crate::field::{Stream, view_encoding};
 
 /// One stream of a model at one time.

@@ -3,9 +3,9 @@
 use pulp::{Simd, WithSimd};
 
 use super::adam::{StepSize, TableState};
+use crate::field::batch::StreamBatch;
 use crate::field::encoding::Level;
 use crate::field::hashgrid::{Around, Row};
-use crate::field::stream::StreamBatch;
 use crate::tasks::PerThread;
 
 /// Buffers of one thread, used for one table after the other.

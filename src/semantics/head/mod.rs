@@ -20,10 +20,10 @@ use serde::{Deserialize, Serialize};
 
 pub use self::render::{FeatureImage, render_features, trace_frame, trace_pixels};
 use super::config::{HeadStreamConfig, SemanticsConfig};
+use crate::field::batch::StreamBatch;
 use crate::field::encoding::Encoding;
 use crate::field::hashgrid::{FEATURES, HashGrid, Row};
 use crate::field::mlp::{Activations, Mlp, Packed, Precision};
-use crate::field::stream::StreamBatch;
 use crate::field::{FieldShape, Stream};
 use crate::rng::Rng;
 use crate::simd::TILE;

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::HeadModel;
 use super::cache::Sources;
-use crate::field::stream::StreamBatch;
+use crate::field::batch::StreamBatch;
 use crate::render::forward::{Model, RayInput};
 use crate::render::rays::{View, pixel_directions};
 use crate::render::sampler::Sampling;

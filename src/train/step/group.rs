@@ -4,7 +4,8 @@ use glam::{Vec2, Vec3};
 use pulp::Simd;
 
 use super::{CHUNK_RAYS, Companion, StepPlan};
-use crate::field::stream::{StreamActivations, StreamBatch, Tiles};
+use crate::field::batch::StreamBatch;
+use crate::field::stream::{StreamActivations, Tiles};
 use crate::render::density_grid::DensityGrid;
 use crate::render::forward::{Chunk, Faint, Model, RayInput, Tracer};
 use crate::render::rays::View;

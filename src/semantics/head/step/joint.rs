@@ -8,7 +8,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use pulp::{Simd, WithSimd};
 
 use super::{Group, HeadOptimiser, HeadStep, RayTargets};
-use crate::field::stream::StreamBatch;
+use crate::field::batch::StreamBatch;
 use crate::render::forward::Chunk;
 use crate::rng::Rng;
 use crate::semantics::head::cache::{find, select};
