@@ -84,6 +84,26 @@ fn the_wall_is_learned() {
     assert!(seen > 18.0, "a frame that was trained on has {seen} dB");
 }
 
+#[test]
+fn samples_are_placed_more_sharply_only_where_nothing_moves() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    // The streams are settled in the first of two reports, never, and settled but with all of them there.
+    let cases = [
+        (StreamChoice::Static, 0.3, true),
+        (StreamChoice::Static, 1.0, false),
+        (StreamChoice::All, 0.3, false),
+    ];
+    for (streams, static_until, differs) in cases {
+        let mut soft = config(static_until);
+        soft.train.streams = streams;
+        let mut sharp = soft.clone();
+        sharp.train.still_sharpness *= 4.0;
+        let [soft, sharp] = [soft, sharp].map(|config| train(&scene, &config, 2).0);
+        assert_eq!(soft != sharp, differs, "{streams:?}, settled after {static_until} of the schedule");
+    }
+}
+
 /// A kitchen in 24 small pictures: what each encoding says of them after some hundred steps must be far better than the
 /// best single colour.
 #[test]
