@@ -4,13 +4,14 @@
 //! business of the arithmetic: `vector` computes in f32, `matrix` multiplies in bf16 and sums in f32. Both keep a
 //! chunk's activations together, so that the weight gradients are products over many of its samples.
 
+mod gradient;
 mod matrix;
 mod vector;
 
 use pulp::Simd;
 use serde::{Deserialize, Serialize};
 
-use self::vector::TileView;
+use self::gradient::{Sums, TileView};
 use crate::simd::floats::{ColumnMut, Floats};
 use crate::simd::lanes::{self, Layout};
 use crate::simd::matrix::{Unit, available};
@@ -25,15 +26,6 @@ const BLOCK: usize = 4;
 /// longer for a product with one. This is a thousandth of Adam's ε and its square is still a normal number, after any
 /// network's weights have made it smaller.
 const LEAST_GRADIENT: f32 = 1e-18;
-
-/// Most tiles whose gradients are kept until those of the weights are summed: with what was evaluated there, they stay near
-/// the core, and a sum over fewer would not be worth its end.
-#[inline(always)]
-fn strip<S: Simd>() -> usize {
-    // Six inputs and four outputs of as many tiles fit a nearest cache of 32 KiB, which processors with few registers have, or one of
-    // 48 KiB.
-    if S::REGISTER_COUNT < 32 { 9 } else { 18 }
-}
 
 /// What the networks are multiplied in. Weights, sums, gradients and everything else are f32 in any case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -172,7 +164,7 @@ impl Mlp {
         a.tiles = tiles;
         // As many in every strip, since the sums at the end of one take time.
         let all = a.waiting + tiles;
-        let strip = strip::<S>();
+        let strip = gradient::strip::<S>();
         a.strip = if all < strip { strip } else { all.div_ceil(all.div_ceil(strip)) };
         let kept = a.strip.min(all).max(a.waiting + 1);
         a.grads.reserve_len((kept * a.stride).max(a.end));
@@ -238,11 +230,8 @@ impl Mlp {
             Packed::Matrix(packed) => {
                 packed.backward(unit, &self.layers, grad, &mut a.saved, n);
                 if last {
-                    if !a.summed {
-                        a.sums.zero(self.parameters());
-                    }
-                    packed.accumulate(unit, &self.layers, &mut a.saved, a.tiles, &mut a.sums);
-                    a.summed = true;
+                    let sums = a.sums.of(self.parameters());
+                    packed.accumulate(unit, &self.layers, &mut a.saved, a.tiles, sums);
                 }
             }
         }
@@ -253,11 +242,8 @@ impl Mlp {
     fn sum<S: Simd>(&self, simd: S, a: &mut Activations, first: usize) {
         let view = |data| TileView { data, stride: a.stride, offset: 0 };
         let (values, grads) = (view(&a.values[first * a.stride..]), view(&a.grads));
-        if !a.summed {
-            a.sums.zero(BLOCK * self.parameters());
-        }
-        vector::accumulate(simd, &self.layers, values, grads, a.waiting, &mut a.sums);
-        (a.waiting, a.summed) = (0, true);
+        a.sums.add(simd, &self.layers, values, grads, a.waiting);
+        a.waiting = 0;
     }
 
     /// Adds the parameter gradients of all tiles that have gone [`Self::backward`] to `out`, in the order of the parameters.
@@ -267,11 +253,9 @@ impl Mlp {
             self.sum(simd, a, 0);
         }
         match packed {
-            _ if !a.summed => {}
-            Packed::Vector(_) => vector::unpack(&self.layers, &a.sums, out),
-            Packed::Matrix(_) => out.iter_mut().zip(&*a.sums).for_each(|(out, sum)| *out += sum),
+            Packed::Vector(_) => a.sums.unpack::<S>(&self.layers, out),
+            Packed::Matrix(_) => a.sums.add_to(out),
         }
-        a.summed = false;
     }
 }
 
@@ -335,9 +319,8 @@ pub struct Activations {
     waiting: usize,
     /// Place of the gradients of the tile that went backward last.
     latest: usize,
-    /// The parameters' gradients, in the order of the arithmetic, and whether there are any.
-    sums: AlignedVec,
-    summed: bool,
+    /// The parameters' gradients.
+    sums: Sums,
     /// Floats of a tile's input and output.
     input: usize,
     output: usize,
@@ -371,6 +354,7 @@ impl Activations {
 
     /// Forgets gradients that nobody has asked for.
     pub fn clear(&mut self) {
-        (self.first, self.waiting, self.summed) = (0, 0, false);
+        (self.first, self.waiting) = (0, 0);
+        self.sums.clear();
     }
 }

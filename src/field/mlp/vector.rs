@@ -3,11 +3,10 @@
 //! A tile holds all its layers one after the other: `input | layer 1 | layer 2 | ...`, gradients likewise. Before a layer
 //! that sees the input again, there is a copy of it.
 
-use glam::Vec4;
 use pulp::Simd;
 
 use super::{BLOCK, Layer};
-use crate::simd::{Finish, TILE, add_quarter_sums, multiply, prefetch_rows};
+use crate::simd::{Finish, TILE, multiply, prefetch_rows};
 
 /// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
 pub struct Packed {
@@ -76,104 +75,6 @@ impl Packed {
                 *g += again;
             }
         }
-    }
-}
-
-/// Four numbers each of four parameters' gradient, which are yet to be summed: number `n` of all sixteen is of parameter `n % 4`.
-type Partial = [f32; BLOCK * BLOCK];
-
-/// Adds the parameter gradients of `count` tiles to `sums`, four numbers a parameter.
-///
-/// Layer by layer, of four outputs after the other the weights input by input, then the biases.
-#[inline(always)]
-pub(super) fn accumulate<S: Simd>(
-    simd: S,
-    layers: &[Layer],
-    tiles: TileView,
-    grads: TileView,
-    count: usize,
-    sums: &mut [f32],
-) {
-    let (sums, _) = sums.as_chunks_mut();
-    for layer in layers {
-        let (weights, biases) = sums[layer.param / BLOCK..].split_at_mut(layer.weights() / BLOCK);
-        let x = tiles.rows(layer.row);
-        let dy = grads.rows(layer.row + layer.n_in);
-        for (block, bias) in biases[..layer.n_out / BLOCK].iter_mut().enumerate() {
-            bias_gradient(simd, dy.rows(block * BLOCK), count, bias);
-        }
-        // The inputs, of which there are more at a time than outputs, stay in the nearest cache while all outputs pass.
-        let mut i = 0;
-        while i < layer.n_in {
-            let wide = inputs_together(layer.n_in - i);
-            let x = x.rows(i);
-            for (block, weights) in weights.chunks_exact_mut(layer.n_in).enumerate() {
-                let (dy, out) = (dy.rows(block * BLOCK), &mut weights[i..i + wide]);
-                match wide {
-                    6 => outer_product::<S, 6>(simd, dy, x, count, out),
-                    4 => outer_product::<S, 4>(simd, dy, x, count, out),
-                    _ => outer_product::<S, 2>(simd, dy, x, count, out),
-                }
-            }
-            i += wide;
-        }
-    }
-}
-
-/// Of the inputs that are left (an even number) those of which sums fit the registers beside each other: the more, the less is loaded
-/// for a product.
-#[inline(always)]
-fn inputs_together(left: usize) -> usize {
-    match left {
-        // Two fours rather than a two at the end.
-        2 | 4 | 8 => left.min(4),
-        _ => 6,
-    }
-}
-
-/// Adds `sums` to `out`, in the order of the parameters.
-pub(super) fn unpack(layers: &[Layer], sums: &[f32], out: &mut [f32]) {
-    let (sums, _) = sums.as_chunks();
-    for layer in layers {
-        let (weights, biases) = sums[layer.param / BLOCK..].split_at(layer.weights() / BLOCK);
-        let (gw, gb) = out[layer.param..].split_at_mut(layer.weights());
-        let rows = gw.chunks_exact_mut(BLOCK * layer.n_in).zip(gb.chunks_exact_mut(BLOCK));
-        for ((gw, gb), (weights, bias)) in rows.zip(weights.chunks_exact(layer.n_in).zip(biases)) {
-            for (i, partial) in weights.iter().enumerate() {
-                for (j, sum) in summed(partial).into_iter().enumerate() {
-                    gw[j * layer.n_in + i] += sum;
-                }
-            }
-            gb.iter_mut().zip(summed(bias)).for_each(|(g, sum)| *g += sum);
-        }
-    }
-}
-
-fn summed(partial: &Partial) -> [f32; BLOCK] {
-    let [a, b, c, d] = [0, 1, 2, 3].map(|n| Vec4::from_slice(&partial[n * BLOCK..]));
-    ((a + b) + (c + d)).to_array()
-}
-
-/// The same rows of many tiles: `data[tile * stride + row * TILE ..]`.
-#[derive(Clone, Copy)]
-pub struct TileView<'a> {
-    /// Tiles one after the other.
-    pub data: &'a [f32],
-    /// Floats from one tile to the next.
-    pub stride: usize,
-    /// Float offset of row 0 within a tile.
-    pub offset: usize,
-}
-
-impl<'a> TileView<'a> {
-    #[inline(always)]
-    fn rows(self, row: usize) -> Self {
-        Self { offset: self.offset + row * TILE, ..self }
-    }
-
-    #[inline(always)]
-    fn block<S: Simd>(self, tile: usize, rows: usize) -> &'a [S::f32s] {
-        S::as_simd_f32s(&self.data[tile * self.stride + self.offset..][..rows * TILE]).0
     }
 }
 
@@ -281,85 +182,4 @@ fn finish_rows<S: Simd, const WIDE: usize>(
             }
         }
     }
-}
-
-/// Adds Σ over samples of dy[j] x[k] to `out`, for four outputs and `WIDE` inputs: for half of the outputs at a time where registers
-/// are few.
-#[inline(always)]
-fn outer_product<S: Simd, const WIDE: usize>(
-    simd: S,
-    dy: TileView,
-    x: TileView,
-    count: usize,
-    out: &mut [Partial],
-) {
-    if S::REGISTER_COUNT < 32 {
-        let (first, second) = (
-            outputs_by_inputs::<S, 2, WIDE>(simd, dy, x, count),
-            outputs_by_inputs::<S, 2, WIDE>(simd, dy.rows(2), x, count),
-        );
-        let mut acc = [[simd.splat_f32s(0.0); BLOCK]; WIDE];
-        for k in 0..WIDE {
-            acc[k] = [first[k][0], first[k][1], second[k][0], second[k][1]];
-        }
-        add_sums::<S, _>(&acc, out);
-    } else {
-        let sums = outputs_by_inputs::<S, BLOCK, WIDE>(simd, dy, x, count);
-        add_sums::<S, _>(&sums, out);
-    }
-}
-
-/// Σ over samples of dy[j] x[k], `[k][j]`, but for the sum over lanes.
-#[inline(always)]
-fn outputs_by_inputs<S: Simd, const OUTPUTS: usize, const INPUTS: usize>(
-    simd: S,
-    dy: TileView,
-    x: TileView,
-    count: usize,
-) -> [[S::f32s; OUTPUTS]; INPUTS] {
-    let vectors = TILE / S::F32_LANES;
-    let mut acc = [[simd.splat_f32s(0.0); OUTPUTS]; INPUTS];
-    for tile in 0..count {
-        let dy = dy.block::<S>(tile, OUTPUTS);
-        let x = x.block::<S>(tile, INPUTS);
-        for v in 0..vectors {
-            let mut d = [dy[v]; OUTPUTS];
-            for j in 1..OUTPUTS {
-                d[j] = dy[j * vectors + v];
-            }
-            for k in 0..INPUTS {
-                let x = x[k * vectors + v];
-                for j in 0..OUTPUTS {
-                    acc[k][j] = simd.mul_add_e_f32s(d[j], x, acc[k][j]);
-                }
-            }
-        }
-    }
-    acc
-}
-
-/// Adds Σ over samples of dy[j] to `out`.
-#[inline(always)]
-fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Partial) {
-    let vectors = TILE / S::F32_LANES;
-    // Sums of their own for every third vector, so that none waits for the one before it.
-    let mut acc = [[simd.splat_f32s(0.0); BLOCK]; 3];
-    for tile in 0..count {
-        let dy = dy.block::<S>(tile, BLOCK);
-        for v in 0..vectors {
-            for j in 0..BLOCK {
-                acc[v % 3][j] = simd.add_f32s(acc[v % 3][j], dy[j * vectors + v]);
-            }
-        }
-    }
-    for j in 0..BLOCK {
-        acc[0][j] = simd.add_f32s(acc[0][j], simd.add_f32s(acc[1][j], acc[2][j]));
-    }
-    add_sums::<S, _>(&[acc[0]], std::slice::from_mut(out));
-}
-
-/// Adds the lanes of four vectors each to `out`, as far as they are summed there.
-#[inline(always)]
-fn add_sums<S: Simd, const N: usize>(vectors: &[[S::f32s; BLOCK]; N], out: &mut [Partial]) {
-    add_quarter_sums(bytemuck::cast_slice(vectors.as_flattened()), S::F32_LANES, out);
 }

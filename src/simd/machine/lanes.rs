@@ -139,17 +139,51 @@ fn add_halves(a: __m512, b: __m512) -> __m512 {
     _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b))
 }
 
-/// As [`super::add_quarter_sums`] of eight: a half of a register has a part of four rows, and half of the numbers stay as they are.
+/// As [`super::columns`], which has asserted that all lengths fit.
 #[target_feature(enable = "avx")]
-pub fn add_half_sums(rows: &[f32], out: &mut [[f32; LANES]]) {
-    for (out, rows) in out.iter_mut().zip(rows.as_chunks::<EIGHT>().0.as_chunks::<4>().0) {
-        // SAFETY: as many floats as are read of each row, and fewer than there are read and written.
-        unsafe {
-            let ab = _mm256_hadd_ps(_mm256_loadu_ps(rows[0].as_ptr()), _mm256_loadu_ps(rows[1].as_ptr()));
-            let cd = _mm256_hadd_ps(_mm256_loadu_ps(rows[2].as_ptr()), _mm256_loadu_ps(rows[3].as_ptr()));
-            let sums = _mm256_hadd_ps(ab, cd);
-            let sums = _mm256_add_ps(_mm256_loadu_ps(out.as_ptr()), sums);
-            _mm256_storeu_ps(out.as_mut_ptr(), sums);
+pub fn columns(rows: &[f32], width: usize, out: &mut [f32]) {
+    let (eights, _) = rows.as_chunks::<{ EIGHT * TILE }>();
+    for (j, rows) in eights.iter().enumerate() {
+        for n in (0..TILE).step_by(EIGHT) {
+            let columns = transposed(&rows[n..]);
+            for (out, column) in out[n * width + j * EIGHT..].chunks_mut(width).zip(columns) {
+                // SAFETY: as many floats as are written.
+                unsafe { _mm256_storeu_ps(out[..EIGHT].as_mut_ptr(), column) };
+            }
         }
     }
+    if eights.len() * EIGHT < width {
+        super::columns_one_by_one(rows, eights.len() * EIGHT, width, out);
+    }
+}
+
+/// Eight numbers of each of eight rows of a tile, as columns.
+#[inline]
+#[target_feature(enable = "avx")]
+fn transposed(rows: &[f32]) -> [__m256; EIGHT] {
+    assert!(rows.len() >= (EIGHT - 1) * TILE + EIGHT);
+    let half = |j: usize, n: usize| {
+        let at = rows.as_ptr().wrapping_add(j * TILE + n);
+        // SAFETY: four floats of each of two rows, of which there are as many as has been asserted.
+        unsafe {
+            _mm256_insertf128_ps::<1>(
+                _mm256_castps128_ps256(_mm_loadu_ps(at)),
+                _mm_loadu_ps(at.wrapping_add(4 * TILE)),
+            )
+        }
+    };
+    // Of four numbers each of rows j and j + 4, then of all.
+    let columns = |n: usize| {
+        let [a, b, c, d] = [half(0, n), half(1, n), half(2, n), half(3, n)];
+        let [ab, cd] = [_mm256_unpacklo_ps(a, b), _mm256_unpacklo_ps(c, d)];
+        let [ef, gh] = [_mm256_unpackhi_ps(a, b), _mm256_unpackhi_ps(c, d)];
+        [
+            _mm256_shuffle_ps::<0x44>(ab, cd),
+            _mm256_shuffle_ps::<0xee>(ab, cd),
+            _mm256_shuffle_ps::<0x44>(ef, gh),
+            _mm256_shuffle_ps::<0xee>(ef, gh),
+        ]
+    };
+    let [[a, b, c, d], [e, f, g, h]] = [columns(0), columns(4)];
+    [a, b, c, d, e, f, g, h]
 }

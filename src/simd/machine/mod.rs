@@ -43,15 +43,34 @@ pub fn prefetch_rows<T>(rows: &[T], at: usize, stride: usize) {
 #[inline(always)]
 pub fn add_quarter_sums(rows: &[f32], lanes: usize, out: &mut [[f32; 16]]) {
     #[cfg(target_arch = "x86_64")]
-    match lanes {
+    if lanes == 16 && is_x86_feature_detected!("avx512f") {
         // SAFETY: this processor has the instructions.
-        16 if is_x86_feature_detected!("avx512f") => return unsafe { lanes::add_quarter_sums(rows, out) },
-        // SAFETY: likewise.
-        8 if is_x86_feature_detected!("avx") => return unsafe { lanes::add_half_sums(rows, out) },
-        _ => {}
+        return unsafe { lanes::add_quarter_sums(rows, out) };
     }
     for (out, rows) in out.iter_mut().zip(rows.chunks_exact(4 * lanes)) {
         out.iter_mut().zip(rows.chunks_exact(lanes)).for_each(|(out, row)| *out += row.iter().sum::<f32>());
+    }
+}
+
+/// Writes `rows` of a tile as columns: lane `n` of row `j` to `out[n * width + j]`. There are at most `width` of them, a multiple of
+/// eight; what has no row is 0.
+#[inline(always)]
+pub fn columns(rows: &[f32], width: usize, out: &mut [f32]) {
+    assert!(width.is_multiple_of(8) && rows.len() <= width * TILE && out.len() == width * TILE);
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx") {
+        // SAFETY: this processor has the instructions.
+        return unsafe { lanes::columns(rows, width, out) };
+    }
+    columns_one_by_one(rows, 0, width, out);
+}
+
+/// Columns from number `first` on.
+fn columns_one_by_one(rows: &[f32], first: usize, width: usize, out: &mut [f32]) {
+    for (n, out) in out.chunks_exact_mut(width).enumerate() {
+        for (j, out) in out.iter_mut().enumerate().skip(first) {
+            *out = rows.get(j * TILE + n).copied().unwrap_or_default();
+        }
     }
 }
 
@@ -121,6 +140,17 @@ pub fn keep_lanes(values: &mut [f32], layout: Layout, kept: &[u32], first: usize
 mod tests {
     use super::*;
     use crate::rng::Rng;
+
+    #[test]
+    fn columns_are_those_of_one_number_after_the_other() {
+        for (rows, width) in [(0, 8), (4, 8), (8, 8), (12, 16), (16, 16)] {
+            let rows: Vec<f32> = (1..=rows * TILE).map(|n| n as f32).collect();
+            let [mut fast, mut slow] = [(); 2].map(|()| vec![-1.0; width * TILE]);
+            columns(&rows, width, &mut fast);
+            columns_one_by_one(&rows, 0, width, &mut slow);
+            assert_eq!(fast, slow);
+        }
+    }
 
     #[test]
     fn products_are_those_of_one_number_after_the_other() {

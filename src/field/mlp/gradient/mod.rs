@@ -1,0 +1,130 @@
+//! Gradients of weights in f32: sums over samples of an output's gradient times an input.
+//!
+//! Vectors of samples are what tiles hold, but then a sum over lanes is left for every weight ([`by_samples`]); where registers are
+//! few, it weighs too much, and vectors of outputs are made first ([`by_outputs`]).
+
+mod by_outputs;
+mod by_samples;
+
+use pulp::Simd;
+
+use super::Layer;
+use crate::simd::{AlignedVec, TILE};
+
+/// Whether vectors are to hold outputs, as they are with AVX2.
+#[inline(always)]
+fn is_by_outputs<S: Simd>() -> bool {
+    cfg!(target_arch = "x86_64") && S::F32_LANES == by_outputs::LANES
+}
+
+/// Most tiles whose gradients are kept until those of the weights are summed: with what was evaluated there, they stay near
+/// the core, and a sum over fewer would not be worth its end.
+#[inline(always)]
+pub fn strip<S: Simd>() -> usize {
+    if is_by_outputs::<S>() {
+        // Sums have no end, so that the nearest cache may decide.
+        2
+    } else if S::REGISTER_COUNT < 32 {
+        // Six inputs and four outputs of as many tiles fit a nearest cache of 32 KiB, which processors with few registers have, or
+        // one of 48 KiB.
+        9
+    } else {
+        18
+    }
+}
+
+/// Sums of parameters' gradients, in whatever order the arithmetic has them.
+#[derive(Default)]
+pub struct Sums {
+    values: AlignedVec,
+    any: bool,
+    /// What vectors of outputs are made in.
+    columns: AlignedVec,
+}
+
+impl Sums {
+    /// Forgets them.
+    pub fn clear(&mut self) {
+        self.any = false;
+    }
+
+    /// Those of `len` parameters or parts of them; where there were none, zeros.
+    pub fn of(&mut self, len: usize) -> &mut [f32] {
+        if !std::mem::replace(&mut self.any, true) {
+            self.values.zero(len);
+        }
+        &mut self.values[..len]
+    }
+
+    /// Adds the gradients of `count` tiles.
+    #[inline(always)]
+    pub fn add<S: Simd>(
+        &mut self,
+        simd: S,
+        layers: &[Layer],
+        tiles: TileView,
+        grads: TileView,
+        count: usize,
+    ) {
+        if is_by_outputs::<S>() {
+            let mut columns = std::mem::take(&mut self.columns);
+            let sums = self.of(by_outputs::len(layers));
+            by_outputs::accumulate(simd, layers, tiles, grads, count, sums, &mut columns);
+            self.columns = columns;
+        } else {
+            by_samples::accumulate(simd, layers, tiles, grads, count, self.of(by_samples::len(layers)));
+        }
+    }
+
+    /// Adds what [`Self::add`] has summed to `out`, in the order of the parameters, and forgets it.
+    #[inline(always)]
+    pub fn unpack<S: Simd>(&mut self, layers: &[Layer], out: &mut [f32]) {
+        if std::mem::take(&mut self.any) {
+            let unpack = if is_by_outputs::<S>() { by_outputs::unpack } else { by_samples::unpack };
+            unpack(layers, &self.values, out);
+        }
+    }
+
+    /// Adds them to `out`, whose order they have, and forgets them.
+    pub fn add_to(&mut self, out: &mut [f32]) {
+        if std::mem::take(&mut self.any) {
+            out.iter_mut().zip(&*self.values).for_each(|(out, sum)| *out += sum);
+        }
+    }
+}
+
+/// Of the inputs that are left (an even number) those of which sums fit the registers beside each other: the more, the less is loaded
+/// for a product.
+#[inline(always)]
+fn inputs_together(left: usize) -> usize {
+    match left {
+        // Two fours rather than a two at the end.
+        2 | 4 | 8 => left.min(4),
+        _ => 6,
+    }
+}
+
+/// The same rows of many tiles: `data[tile * stride + row * TILE ..]`.
+#[derive(Clone, Copy)]
+pub struct TileView<'a> {
+    /// Tiles one after the other.
+    pub data: &'a [f32],
+    /// Floats from one tile to the next.
+    pub stride: usize,
+    /// Float offset of row 0 within a tile.
+    pub offset: usize,
+}
+
+impl<'a> TileView<'a> {
+    /// The same from row `row` on.
+    #[inline(always)]
+    fn rows(self, row: usize) -> Self {
+        Self { offset: self.offset + row * TILE, ..self }
+    }
+
+    /// The first `rows` rows of tile `tile`.
+    #[inline(always)]
+    fn of(self, tile: usize, rows: usize) -> &'a [f32] {
+        &self.data[tile * self.stride + self.offset..][..rows * TILE]
+    }
+}
