@@ -19,6 +19,7 @@ use super::blocks::{BlockSet, CELLS, CORNERS, POINTS, point_index};
 use super::march_dense::bits::{LANES, inside_word};
 use super::mc_table::{EDGES, TABLE};
 use super::{ExtractError, SparseGrid, TriMesh};
+use crate::simd::prefetch;
 
 /// Rows of corners in a block.
 const ROWS: usize = CORNERS * CORNERS;
@@ -42,7 +43,7 @@ pub fn march(grid: &SparseGrid, iso: f32) -> Result<TriMesh, ExtractError> {
     ExtractError::require(iso.is_finite(), "iso", iso, "finite")?;
     let (arch, cases) = (Arch::new(), &*CASES);
     let mark = |(b, values)| arch.dispatch(MarkBlock { values, iso, blocks: &grid.blocks, cases, b });
-    let mut marks: Vec<Option<Box<Mark>>> = grid.values.par_chunks(POINTS).enumerate().map(mark).collect();
+    let mut marks: Vec<Option<Mark>> = grid.values.par_chunks(POINTS).enumerate().map(mark).collect();
     let [vertices, triangles] = number(&mut marks)?;
 
     // Zeroed by the system, page by page, when a thread first writes there.
@@ -51,8 +52,10 @@ pub fn march(grid: &SparseGrid, iso: f32) -> Result<TriMesh, ExtractError> {
     let positions = split(&mut mesh.positions, marked().map(|m| usize::from(m.vertices)));
     let triangles = split(&mut mesh.triangles, marked().map(|m| usize::from(m.triangles)));
     let blocks: Vec<usize> = (0..marks.len()).filter(|&b| marks[b].is_some()).collect();
-    blocks.into_par_iter().zip(positions).zip(triangles).for_each(|((b, positions), triangles)| {
-        arch.dispatch(WriteBlock { grid, iso, marks: &marks, cases, b, positions, triangles });
+    let parts = blocks.par_iter().enumerate().zip(positions).zip(triangles);
+    parts.for_each_init(Edges::default, |edges, (((n, &b), positions), triangles)| {
+        let next = blocks.get(n + 1).copied();
+        arch.dispatch(WriteBlock { grid, iso, marks: &marks, cases, b, next, positions, triangles, edges });
     });
     if marked().any(|m| m.known.is_some()) {
         // An edge between two known corners may lie on unknown cells only.
@@ -72,15 +75,20 @@ pub(crate) fn crossing(a: f32, b: f32, iso: f32) -> f32 {
 /// Bits of the corners of a block: bit x of row z · [`CORNERS`] + y.
 type Rows = [u16; ROWS];
 
-/// A block with a surface, and what it counts of it.
+/// A block with a surface: what it counts of it, side by side with what others count, and where that is.
 struct Mark {
-    inside: Rows,
-    /// `None`: all are.
+    rows: Box<MarkRows>,
+    /// Corners that are known; `None`: all are.
     known: Option<Box<Rows>>,
     /// Number of the block's first vertex.
     first: u32,
     vertices: u16,
     triangles: u16,
+}
+
+/// Where a block has a surface.
+struct MarkRows {
+    inside: Rows,
     /// Per axis: the edges that start at these corners are cut, and the block's own.
     own: [Rows; 3],
     /// Per axis and row: the block's vertices before this row.
@@ -93,7 +101,7 @@ impl Mark {
     fn cut(&self, axis: usize, row: usize) -> u16 {
         // A row of corners has one edge less along itself.
         let mask = if axis == 0 { ALL_CORNERS >> 1 } else { ALL_CORNERS };
-        let [a, b] = ends(&self.inside, axis, row);
+        let [a, b] = ends(&self.rows.inside, axis, row);
         let Some(known) = &self.known else { return (a ^ b) & mask };
         let [here, there] = ends(known, axis, row);
         (a ^ b) & here & there & mask
@@ -114,8 +122,8 @@ impl Mark {
                 for y in 0..edge_rows(axis, 1) {
                     let row = z * CORNERS + y;
                     let own = self.cut(axis, row) & owned[side(z)][side(y)];
-                    self.own[axis][row] = own;
-                    self.before[axis][row] = self.vertices;
+                    self.rows.own[axis][row] = own;
+                    self.rows.before[axis][row] = self.vertices;
                     self.vertices += own.count_ones() as u16;
                 }
             }
@@ -125,16 +133,16 @@ impl Mark {
     /// Number of the vertex on the own edge along `axis` from corner `p`.
     #[inline(always)]
     fn vertex(&self, axis: usize, p: [usize; 3]) -> u32 {
-        let row = p[2] * CORNERS + p[1];
-        let before_in_row = (self.own[axis][row] & ((1 << p[0]) - 1)).count_ones();
-        self.first + u32::from(self.before[axis][row]) + before_in_row
+        let row = row_of(p);
+        let before_in_row = (self.rows.own[axis][row] & ((1 << p[0]) - 1)).count_ones();
+        self.first + u32::from(self.rows.before[axis][row]) + before_in_row
     }
 
     /// The cells between row `row` and its neighbours along y and z.
     // No closures here and where it is called: they may be compiled without the caller's vector features.
     #[inline(always)]
     fn cells(&self, row: usize) -> Cells {
-        let rows = around(&self.inside, row);
+        let rows = around(&self.rows.inside, row);
         let (some, every) = (rows[0] | rows[1] | rows[2] | rows[3], rows[0] & rows[1] & rows[2] & rows[3]);
         let mut active = (some | some >> 1) & !(every & every >> 1) & 0xff;
         if let (Some(known), true) = (&self.known, active != 0) {
@@ -144,6 +152,12 @@ impl Mark {
         }
         Cells { rows, active }
     }
+}
+
+/// The row of corner `p`.
+#[inline(always)]
+fn row_of(p: [usize; 3]) -> usize {
+    p[2] * CORNERS + p[1]
 }
 
 /// The rows at both ends of the edges along `axis` from a row's corners.
@@ -211,7 +225,7 @@ struct MarkBlock<'a> {
 }
 
 impl WithSimd for MarkBlock<'_> {
-    type Output = Option<Box<Mark>>;
+    type Output = Option<Mark>;
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) -> Self::Output {
@@ -231,15 +245,9 @@ impl WithSimd for MarkBlock<'_> {
         }
         let not_finite = exponents.iter().fold(0, |all, e| all | e) >> 31 != 0;
         let known = not_finite.then(|| Box::new(known_rows(values)));
-        let mut mark = Box::new(Mark {
-            inside: rows_of(&words),
-            known: known.filter(|rows| rows.iter().any(|row| *row != ALL_CORNERS)),
-            first: 0,
-            vertices: 0,
-            triangles: 0,
-            own: [[0; ROWS]; 3],
-            before: [[0; ROWS]; 3],
-        });
+        let rows = MarkRows { inside: rows_of(&words), own: [[0; ROWS]; 3], before: [[0; ROWS]; 3] };
+        let known = known.filter(|rows| rows.iter().any(|row| *row != ALL_CORNERS));
+        let mut mark = Mark { rows: Box::new(rows), known, first: 0, vertices: 0, triangles: 0 };
         mark.mark_own(blocks, b);
         for row in cell_rows() {
             let mut cells = mark.cells(row);
@@ -272,7 +280,7 @@ fn known_rows(values: &[f32]) -> Rows {
 }
 
 /// Gives every block the number of its first vertex; returns the numbers of vertices and triangles.
-fn number(marks: &mut [Option<Box<Mark>>]) -> Result<[usize; 2], ExtractError> {
+fn number(marks: &mut [Option<Mark>]) -> Result<[usize; 2], ExtractError> {
     let [mut vertices, mut triangles] = [0usize; 2];
     for mark in marks.iter_mut().flatten() {
         mark.first = vertices as u32;
@@ -299,15 +307,42 @@ pub(crate) fn split<T>(mut rest: &mut [T], lengths: impl Iterator<Item = usize>)
     lengths.map(next).collect()
 }
 
+/// An edge of a block whose vertex another block numbers.
+#[derive(Clone, Copy, Default)]
+struct Shared {
+    /// Its place in the block, by axis and first corner.
+    place: usize,
+    axis: usize,
+    owner: usize,
+    /// Its first corner in the owner.
+    p: [usize; 3],
+}
+
+/// Buffers of one worker.
+struct Edges {
+    /// Numbers of the vertices on edges, by axis and first corner; of edges that are not cut nobody asks.
+    numbers: Box<[u32; 3 * POINTS]>,
+    shared: Vec<Shared>,
+}
+
+impl Default for Edges {
+    fn default() -> Self {
+        Self { numbers: Box::new([0; 3 * POINTS]), shared: Vec::new() }
+    }
+}
+
 /// Writes a block's vertices and triangles.
 struct WriteBlock<'a> {
     grid: &'a SparseGrid,
     iso: f32,
-    marks: &'a [Option<Box<Mark>>],
+    marks: &'a [Option<Mark>],
     cases: &'a [Case; 256],
     b: usize,
+    /// The block that is written after it.
+    next: Option<usize>,
     positions: &'a mut [[f32; 3]],
     triangles: &'a mut [[u32; 3]],
+    edges: &'a mut Edges,
 }
 
 impl WithSimd for WriteBlock<'_> {
@@ -315,11 +350,11 @@ impl WithSimd for WriteBlock<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, _: S) {
-        let Some(mark) = self.marks[self.b].as_deref() else { return };
-        // By axis and first corner; of edges that are not cut nobody asks.
-        let mut numbers = [0; 3 * POINTS];
-        self.number_edges(mark, &mut numbers);
-        let mut next = 0;
+        let Some(mark) = &self.marks[self.b] else { return };
+        self.fetch_next();
+        self.number_own_edges(mark);
+        self.number_shared_edges();
+        let (numbers, mut next) = (&self.edges.numbers, 0);
         for row in cell_rows() {
             let mut cells = mark.cells(row);
             while let Some((x, case)) = cells.next() {
@@ -338,12 +373,26 @@ impl WithSimd for WriteBlock<'_> {
 }
 
 impl WriteBlock<'_> {
-    /// Writes the vertices of the block's own edges and finds the numbers of all its cut edges.
+    /// Asks for what the next block reads: few of its values, here and there, which the processor does not foresee.
     #[inline(always)]
-    fn number_edges(&mut self, mark: &Mark, numbers: &mut [u32; 3 * POINTS]) {
+    fn fetch_next(&self) {
+        let Some(next) = self.next else { return };
+        let values = &self.grid.values[next * POINTS..][..POINTS];
+        for n in (0..POINTS).step_by(16) {
+            prefetch(&values[n], 0);
+        }
+    }
+
+    /// Writes the vertices of the block's own edges, numbers them, and notes the cut edges that are others'.
+    #[inline(always)]
+    fn number_own_edges(&mut self, mark: &Mark) {
         let Self { grid, iso, marks, b, .. } = *self;
+        let Edges { numbers, shared } = &mut *self.edges;
+        shared.clear();
         let values = &grid.values[b * POINTS..(b + 1) * POINTS];
-        let [x0, y0, z0] = grid.blocks.coords()[b].map(|c| c as usize * CELLS);
+        let first = grid.blocks.coords()[b].map(|c| c as usize * CELLS);
+        let along = |axis: usize| std::array::from_fn(|n| position(first[axis] + n, 0.0, grid.spec.voxel));
+        let corners: [[f32; CORNERS]; 3] = [along(0), along(1), along(2)];
         let mut next = mark.first;
         let mut out = self.positions.iter_mut();
         for axis in 0..3 {
@@ -351,7 +400,7 @@ impl WriteBlock<'_> {
             for z in 0..edge_rows(axis, 2) {
                 for y in 0..edge_rows(axis, 1) {
                     let row = z * CORNERS + y;
-                    let mut own = mark.own[axis][row];
+                    let mut own = mark.rows.own[axis][row];
                     let mut others = mark.cut(axis, row) & !own;
                     while own != 0 {
                         let x = own.trailing_zeros() as usize;
@@ -360,31 +409,43 @@ impl WriteBlock<'_> {
                         numbers[axis * POINTS + i] = next;
                         next += 1;
                         let t = crossing(values[i], values[i + step], iso);
-                        let p = [x0 + x, y0 + y, z0 + z];
                         if let Some(out) = out.next() {
-                            *out = vertex_position(p, axis, t, grid.spec.voxel);
+                            *out = [corners[0][x], corners[1][y], corners[2][z]];
+                            out[axis] = position(first[axis] + [x, y, z][axis], t, grid.spec.voxel);
                         }
                     }
                     while others != 0 {
                         let x = others.trailing_zeros() as usize;
                         others &= others - 1;
                         let (owner, p) = grid.blocks.owner(b, [x, y, z], Some(axis));
-                        // A cut edge has a cut in its owner too, because both store the same corners.
-                        let number = marks[owner].as_deref().map_or(u32::MAX, |owner| owner.vertex(axis, p));
-                        numbers[axis * POINTS + row * CORNERS + x] = number;
+                        // Asked for now and read when all others are known.
+                        if let Some(owner) = &marks[owner] {
+                            prefetch(&owner.rows.own[axis][row_of(p)], 0);
+                            prefetch(&owner.rows.before[axis][row_of(p)], 0);
+                        }
+                        shared.push(Shared { place: axis * POINTS + row * CORNERS + x, axis, owner, p });
                     }
                 }
             }
         }
     }
+
+    /// Finds the numbers of the edges that are others'.
+    #[inline(always)]
+    fn number_shared_edges(&mut self) {
+        let Edges { numbers, shared } = &mut *self.edges;
+        for Shared { place, axis, owner, p } in &*shared {
+            // A cut edge has a cut in its owner too, because both store the same corners.
+            let number = self.marks[*owner].as_ref().map_or(u32::MAX, |owner| owner.vertex(*axis, *p));
+            numbers[*place] = number;
+        }
+    }
 }
 
-/// The point at `t` along the edge that starts at corner `p` and runs along `axis`.
+/// Where `t` of the way from corner `p` to the next one is along its axis.
 #[inline(always)]
-fn vertex_position(p: [usize; 3], axis: usize, t: f32, voxel: f64) -> [f32; 3] {
-    let mut at = [p[0] as f64, p[1] as f64, p[2] as f64];
-    at[axis] += f64::from(t);
-    [(at[0] * voxel) as f32, (at[1] * voxel) as f32, (at[2] * voxel) as f32]
+fn position(p: usize, t: f32, voxel: f64) -> f32 {
+    ((p as f64 + f64::from(t)) * voxel) as f32
 }
 
 /// The triangles of a case of marching cubes.
