@@ -71,8 +71,10 @@ pub struct TrainConfig {
     pub still_sharpness: f32,
     /// Fraction of the schedule after which a stream is not evaluated where its grid is empty.
     pub skip_from: f64,
+    /// Steps before which everything is fog, which no grid takes for something.
+    pub skip_after: u64,
     /// Share of its pixel's light below which nothing is learned from what a stream is at a sample, nor its colour looked at,
-    /// from `skip_from` on, unless `loss.transient` weighs more than that; 0: everything counts.
+    /// from then on, unless `loss.transient` weighs more than that; 0: everything counts.
     pub faint: f32,
     /// Share of a ray's samples spread evenly at the start, and at the end of the schedule.
     pub explore: [f32; 2],
@@ -109,6 +111,7 @@ impl Default for TrainConfig {
             sharpness: 0.3,
             still_sharpness: 0.3,
             skip_from: 0.1,
+            skip_after: 100,
             faint: 1e-4,
             explore: [0.5, 0.1],
             precision: Precision::Auto,

@@ -38,7 +38,7 @@ impl TrainConfig {
                 sharpness: self.sharpness,
             },
             // Before that the streams are fog, all of which has to be looked at.
-            faint: if progress >= self.skip_from { self.faint } else { 0.0 },
+            faint: if self.skips(step, progress) { self.faint } else { 0.0 },
             time_spread: self.time_spread,
             table_rate: self.table_rate * rate,
             network_rate: network_rate * rate,
@@ -48,6 +48,11 @@ impl TrainConfig {
             streams,
             precision: self.precision,
         }
+    }
+
+    /// Whether step number `step` (from 1) leaves out what is empty or faint.
+    pub fn skips(&self, step: u64, progress: f64) -> bool {
+        progress >= self.skip_from && step > self.skip_after
     }
 
     /// Where samples go when training looks at whole frames, for which as many do as it learns from.

@@ -188,7 +188,7 @@ impl Trainer {
                 self.align();
                 self.trained.progress.aligned = due;
             }
-            if fraction >= self.config.train.skip_from {
+            if self.config.train.skips(self.trained.progress.step + 1, fraction) {
                 self.trained.grids.skip_below(OCCUPIED_ALPHA);
             }
             let report = self.step(fraction, None)?;

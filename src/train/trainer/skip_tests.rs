@@ -31,6 +31,20 @@ fn picture(field: &Field, grids: &Grids, streams: [bool; 3], frame: &Frame) -> R
 }
 
 #[test]
+fn a_training_of_few_steps_skips_nothing_while_all_is_fog() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    for (steps, skip_after, skips) in [(60, 100, false), (60, 10, true), (120, 100, true)] {
+        let mut config = settings();
+        (config.train.steps, config.train.skip_after) = (steps, skip_after);
+        let mut trainer = Trainer::new(&scene, &config).expect("the test's scene is valid");
+        let run = tempfile::tempdir().expect("a temporary folder");
+        trainer.run(run.path(), None, &mut |_| ControlFlow::Continue(())).expect("training goes through");
+        assert_eq!(trainer.trained().grids.threshold != [0.0; 3], skips, "{steps} steps");
+    }
+}
+
+#[test]
 fn a_stream_that_is_nowhere_and_one_that_is_absent_look_the_same() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (scene, trainer) = trained(folder.path());
