@@ -3,12 +3,12 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-# Optimised as in a release, but neither across crates, for every test program would be optimised whole once more, nor our own
-# in one unit, which keeps one processor busy while others wait; and without lines for debuggers. Half an hour in all.
+# Optimised as in a release, but not across crates, for every test program would be optimised whole once more; and without lines
+# for debuggers. Our own crate stays in one unit, since kernels that are not inlined take twice as long, which costs tests more
+# than compiling in many units saves: the library and its tests are compiled side by side anyway. Half an hour in all.
 export CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_DEBUG=none
-profile=(--config profile.release.package.divff.codegen-units=16)
 # Where files are read, numbers that overflow and assertions that do not hold count as well.
-profile+=(--config profile.release.package.divff-exporters.overflow-checks=true)
+profile=(--config profile.release.package.divff-exporters.overflow-checks=true)
 profile+=(--config profile.release.package.divff-exporters.debug-assertions=true)
 
 step() {
