@@ -142,39 +142,38 @@ fn add_halves(a: __m512, b: __m512) -> __m512 {
 /// As [`super::columns`], which has asserted that all lengths fit.
 #[target_feature(enable = "avx")]
 pub fn columns(rows: &[f32], width: usize, out: &mut [f32]) {
-    let (eights, _) = rows.as_chunks::<{ EIGHT * TILE }>();
-    for (j, rows) in eights.iter().enumerate() {
+    for (j, rows) in rows.chunks(EIGHT * TILE).enumerate() {
         for n in (0..TILE).step_by(EIGHT) {
-            let columns = transposed(&rows[n..]);
+            let columns = match rows.len() / TILE {
+                EIGHT => transposed::<EIGHT>(&rows[n..]),
+                _ => transposed::<4>(&rows[n..]),
+            };
             for (out, column) in out[n * width + j * EIGHT..].chunks_mut(width).zip(columns) {
                 // SAFETY: as many floats as are written.
                 unsafe { _mm256_storeu_ps(out[..EIGHT].as_mut_ptr(), column) };
             }
         }
     }
-    if eights.len() * EIGHT < width {
-        super::columns_one_by_one(rows, eights.len() * EIGHT, width, out);
-    }
 }
 
-/// Eight numbers of each of eight rows of a tile, as columns.
+/// Eight numbers of each of eight rows of a tile, as columns; of four rows, and zeros below them.
 #[inline]
 #[target_feature(enable = "avx")]
-fn transposed(rows: &[f32]) -> [__m256; EIGHT] {
-    assert!(rows.len() >= (EIGHT - 1) * TILE + EIGHT);
-    let half = |j: usize, n: usize| {
+fn transposed<const ROWS: usize>(rows: &[f32]) -> [__m256; EIGHT] {
+    const { assert!(ROWS == 4 || ROWS == EIGHT) };
+    assert!(rows.len() >= (ROWS - 1) * TILE + EIGHT);
+    // Numbers `n` to `n + 3` of rows `j` and `j + 4`.
+    let halves = |j: usize, n: usize| {
         let at = rows.as_ptr().wrapping_add(j * TILE + n);
-        // SAFETY: four floats of each of two rows, of which there are as many as has been asserted.
+        // SAFETY: four floats of one or two of the rows, of which there are as many as has been asserted.
         unsafe {
-            _mm256_insertf128_ps::<1>(
-                _mm256_castps128_ps256(_mm_loadu_ps(at)),
-                _mm_loadu_ps(at.wrapping_add(4 * TILE)),
-            )
+            let low = _mm_loadu_ps(at);
+            let high = if ROWS > 4 { _mm_loadu_ps(at.wrapping_add(4 * TILE)) } else { _mm_setzero_ps() };
+            _mm256_insertf128_ps::<1>(_mm256_castps128_ps256(low), high)
         }
     };
-    // Of four numbers each of rows j and j + 4, then of all.
     let columns = |n: usize| {
-        let [a, b, c, d] = [half(0, n), half(1, n), half(2, n), half(3, n)];
+        let [a, b, c, d] = [halves(0, n), halves(1, n), halves(2, n), halves(3, n)];
         let [ab, cd] = [_mm256_unpacklo_ps(a, b), _mm256_unpacklo_ps(c, d)];
         let [ef, gh] = [_mm256_unpackhi_ps(a, b), _mm256_unpackhi_ps(c, d)];
         [

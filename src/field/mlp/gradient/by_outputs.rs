@@ -9,7 +9,7 @@ use crate::simd::{AlignedVec, TILE, columns};
 /// Outputs of a vector.
 pub const LANES: usize = 8;
 
-/// Panels of a layer: the first output of each, and how many there are, of which the last may be no outputs.
+/// Panels of a layer: the first output of each, and how many there are, of which the last four may be no outputs.
 fn panels(layer: &Layer) -> impl Iterator<Item = (usize, usize)> {
     let width = |first: usize| if layer.n_out - first > LANES { 2 * LANES } else { LANES };
     (0..layer.n_out).step_by(2 * LANES).map(move |first| (first, width(first)))
