@@ -308,7 +308,6 @@ pub(crate) fn split<T>(mut rest: &mut [T], lengths: impl Iterator<Item = usize>)
 }
 
 /// An edge of a block whose vertex another block numbers.
-#[derive(Clone, Copy, Default)]
 struct Shared {
     /// Its place in the block, by axis and first corner.
     place: usize,

@@ -11,7 +11,7 @@ mod vector;
 use pulp::Simd;
 use serde::{Deserialize, Serialize};
 
-use self::gradient::{Sums, TileView};
+use self::gradient::{Strip, Sums, TileView};
 use crate::simd::floats::{ColumnMut, Floats};
 use crate::simd::lanes::{self, Layout};
 use crate::simd::matrix::{Unit, available};
@@ -26,6 +26,12 @@ const BLOCK: usize = 4;
 /// longer for a product with one. This is a thousandth of Adam's ε and its square is still a normal number, after any
 /// network's weights have made it smaller.
 const LEAST_GRADIENT: f32 = 1e-18;
+
+/// Whether vectors are those of AVX2: eight numbers, in sixteen registers.
+#[inline(always)]
+fn is_like_avx2<S: Simd>() -> bool {
+    cfg!(target_arch = "x86_64") && S::F32_LANES == 8
+}
 
 /// What the networks are multiplied in. Weights, sums, gradients and everything else are f32 in any case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -242,8 +248,8 @@ impl Mlp {
     fn sum<S: Simd>(&self, simd: S, a: &mut Activations, first: usize) {
         let view = |data| TileView { data, stride: a.stride, offset: 0 };
         let (values, grads) = (view(&a.values[first * a.stride..]), view(&a.grads));
-        a.sums.add(simd, &self.layers, values, grads, a.waiting);
-        a.waiting = 0;
+        let count = std::mem::take(&mut a.waiting);
+        a.sums.add(simd, &self.layers, Strip { values, grads, count });
     }
 
     /// Adds the parameter gradients of all tiles that have gone [`Self::backward`] to `out`, in the order of the parameters.

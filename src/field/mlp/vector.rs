@@ -5,7 +5,7 @@
 
 use pulp::Simd;
 
-use super::{BLOCK, Layer};
+use super::{BLOCK, Layer, is_like_avx2};
 use crate::simd::{Finish, TILE, multiply, prefetch_rows};
 
 /// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
@@ -82,7 +82,7 @@ impl Packed {
 #[inline(always)]
 fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], finish: Finish) {
     let vectors = TILE / S::F32_LANES;
-    if cfg!(target_arch = "x86_64") && S::F32_LANES == 8 {
+    if is_like_avx2::<S>() {
         multiply(w.as_chunks().0, bias.as_chunks().0, x, finish, y);
     } else if S::REGISTER_COUNT < 32 && vectors.is_multiple_of(2) {
         // Sums that do not fit the registers would go through memory.

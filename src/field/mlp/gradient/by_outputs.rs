@@ -3,11 +3,11 @@
 use pulp::Simd;
 
 use super::super::Layer;
-use super::{TileView, inputs_together};
+use super::{Strip, TileView, inputs_together};
 use crate::simd::{AlignedVec, TILE, columns};
 
 /// Outputs of a vector.
-pub const LANES: usize = 8;
+const LANES: usize = 8;
 
 /// Panels of a layer: the first output of each, and how many there are, of which the last four may be no outputs.
 fn panels(layer: &Layer) -> impl Iterator<Item = (usize, usize)> {
@@ -20,22 +20,21 @@ pub fn len(layers: &[Layer]) -> usize {
     layers.iter().map(|l| (l.n_in + 1) * l.n_out.next_multiple_of(LANES)).sum()
 }
 
-/// Adds the parameter gradients of `count` tiles to `sums`.
+/// Adds the parameter gradients of a strip to `sums`.
 ///
 /// Layer by layer and panel by panel, of all outputs the weights input by input, then the biases.
 #[inline(always)]
 pub fn accumulate<S: Simd>(
     simd: S,
     layers: &[Layer],
-    tiles: TileView,
-    grads: TileView,
-    count: usize,
+    strip: Strip,
     mut sums: &mut [f32],
     panel: &mut AlignedVec,
 ) {
+    let count = strip.count;
     panel.reserve_len(count * TILE * 2 * LANES);
     for layer in layers {
-        let (x, dy) = (tiles.rows(layer.row), grads.rows(layer.row + layer.n_in));
+        let [x, dy] = strip.of(layer);
         for (first, width) in panels(layer) {
             let panel = &mut panel[..count * TILE * width];
             for (tile, panel) in panel.chunks_exact_mut(TILE * width).enumerate() {

@@ -4,7 +4,7 @@ use glam::Vec4;
 use pulp::Simd;
 
 use super::super::{BLOCK, Layer};
-use super::{TileView, inputs_together};
+use super::{Strip, TileView, inputs_together};
 use crate::simd::{TILE, add_quarter_sums};
 
 /// Four numbers each of four parameters' gradient, which are yet to be summed: number `n` of all sixteen is of parameter `n % 4`.
@@ -15,23 +15,16 @@ pub fn len(layers: &[Layer]) -> usize {
     layers.iter().map(|l| BLOCK * (l.weights() + l.n_out)).sum()
 }
 
-/// Adds the parameter gradients of `count` tiles to `sums`, four numbers a parameter.
+/// Adds the parameter gradients of a strip to `sums`, four numbers a parameter.
 ///
 /// Layer by layer, of four outputs after the other the weights input by input, then the biases.
 #[inline(always)]
-pub fn accumulate<S: Simd>(
-    simd: S,
-    layers: &[Layer],
-    tiles: TileView,
-    grads: TileView,
-    count: usize,
-    sums: &mut [f32],
-) {
+pub fn accumulate<S: Simd>(simd: S, layers: &[Layer], strip: Strip, sums: &mut [f32]) {
+    let count = strip.count;
     let (sums, _) = sums.as_chunks_mut();
     for layer in layers {
         let (weights, biases) = sums[layer.param / BLOCK..].split_at_mut(layer.weights() / BLOCK);
-        let x = tiles.rows(layer.row);
-        let dy = grads.rows(layer.row + layer.n_in);
+        let [x, dy] = strip.of(layer);
         for (block, bias) in biases[..layer.n_out / BLOCK].iter_mut().enumerate() {
             bias_gradient(simd, dy.rows(block * BLOCK), count, bias);
         }

@@ -8,20 +8,14 @@ mod by_samples;
 
 use pulp::Simd;
 
-use super::Layer;
+use super::{Layer, is_like_avx2};
 use crate::simd::{AlignedVec, TILE};
-
-/// Whether vectors are to hold outputs, as they are with AVX2.
-#[inline(always)]
-fn is_by_outputs<S: Simd>() -> bool {
-    cfg!(target_arch = "x86_64") && S::F32_LANES == by_outputs::LANES
-}
 
 /// Most tiles whose gradients are kept until those of the weights are summed: with what was evaluated there, they stay near
 /// the core, and a sum over fewer would not be worth its end.
 #[inline(always)]
 pub fn strip<S: Simd>() -> usize {
-    if is_by_outputs::<S>() {
+    if is_like_avx2::<S>() {
         // Sums have no end, so that the nearest cache may decide.
         2
     } else if S::REGISTER_COUNT < 32 {
@@ -39,7 +33,7 @@ pub struct Sums {
     values: AlignedVec,
     any: bool,
     /// What vectors of outputs are made in.
-    columns: AlignedVec,
+    panel: AlignedVec,
 }
 
 impl Sums {
@@ -56,23 +50,15 @@ impl Sums {
         &mut self.values[..len]
     }
 
-    /// Adds the gradients of `count` tiles.
+    /// Adds the gradients of a strip.
     #[inline(always)]
-    pub fn add<S: Simd>(
-        &mut self,
-        simd: S,
-        layers: &[Layer],
-        tiles: TileView,
-        grads: TileView,
-        count: usize,
-    ) {
-        if is_by_outputs::<S>() {
-            let mut columns = std::mem::take(&mut self.columns);
-            let sums = self.of(by_outputs::len(layers));
-            by_outputs::accumulate(simd, layers, tiles, grads, count, sums, &mut columns);
-            self.columns = columns;
+    pub fn add<S: Simd>(&mut self, simd: S, layers: &[Layer], strip: Strip) {
+        if is_like_avx2::<S>() {
+            let mut panel = std::mem::take(&mut self.panel);
+            by_outputs::accumulate(simd, layers, strip, self.of(by_outputs::len(layers)), &mut panel);
+            self.panel = panel;
         } else {
-            by_samples::accumulate(simd, layers, tiles, grads, count, self.of(by_samples::len(layers)));
+            by_samples::accumulate(simd, layers, strip, self.of(by_samples::len(layers)));
         }
     }
 
@@ -80,7 +66,7 @@ impl Sums {
     #[inline(always)]
     pub fn unpack<S: Simd>(&mut self, layers: &[Layer], out: &mut [f32]) {
         if std::mem::take(&mut self.any) {
-            let unpack = if is_by_outputs::<S>() { by_outputs::unpack } else { by_samples::unpack };
+            let unpack = if is_like_avx2::<S>() { by_outputs::unpack } else { by_samples::unpack };
             unpack(layers, &self.values, out);
         }
     }
@@ -101,6 +87,25 @@ fn inputs_together(left: usize) -> usize {
         // Two fours rather than a two at the end.
         2 | 4 | 8 => left.min(4),
         _ => 6,
+    }
+}
+
+/// Tiles that have gone back through the networks and whose parameter gradients are yet to be summed.
+#[derive(Clone, Copy)]
+pub struct Strip<'a> {
+    /// Their activations.
+    pub values: TileView<'a>,
+    /// The gradients of those.
+    pub grads: TileView<'a>,
+    /// How many they are.
+    pub count: usize,
+}
+
+impl<'a> Strip<'a> {
+    /// What goes into a layer, and the gradients of what comes out of it.
+    #[inline(always)]
+    fn of(self, layer: &Layer) -> [TileView<'a>; 2] {
+        [self.values.rows(layer.row), self.grads.rows(layer.row + layer.n_in)]
     }
 }
 
