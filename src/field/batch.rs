@@ -4,8 +4,12 @@ use glam::{Mat4, Vec3};
 
 use super::encoding::{Encoding, Level};
 use super::hashgrid::{AXES, Around, FEATURES, Points, Row, TIME};
-use crate::simd::TILE;
 use crate::simd::lanes::{self, Layout};
+use crate::simd::{TILE, prefetch};
+
+/// Bytes from a tile's rows of a level to the next tile's, which are needed after those of all other levels: the processor does not
+/// foresee it.
+const NEXT_TILE: usize = TILE * size_of::<Row>();
 
 /// Four rows of four numbers as columns.
 #[inline(always)]
@@ -29,6 +33,7 @@ impl LevelRows {
     pub fn read_tile(&self, tile: usize, out: &mut [f32]) {
         let (rows, _) = self.rows[tile * TILE..][..TILE].as_chunks::<FEATURES>();
         for (n, rows) in rows.iter().enumerate() {
+            prefetch(rows, NEXT_TILE);
             let columns = transposed(*rows);
             for k in 0..FEATURES {
                 out[k * TILE + n * FEATURES..][..FEATURES].copy_from_slice(&columns[k].to_array());
@@ -42,6 +47,7 @@ impl LevelRows {
     pub fn write_tile(&mut self, tile: usize, g: &[f32]) {
         let (rows, _) = self.rows[tile * TILE..][..TILE].as_chunks_mut::<FEATURES>();
         for (n, rows) in rows.iter_mut().enumerate() {
+            prefetch(rows, NEXT_TILE);
             let column = |k: usize| Row::from_slice(&g[k * TILE + n * FEATURES..][..FEATURES]);
             *rows = transposed([column(0), column(1), column(2), column(3)]);
         }

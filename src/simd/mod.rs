@@ -9,7 +9,7 @@ pub mod lanes;
 mod machine;
 pub mod matrix;
 
-pub use machine::{Finish, add_quarter_sums, columns, multiply, prefetch, prefetch_rows};
+pub use machine::{Finish, Product, add_quarter_sums, columns, multiply, prefetch, prefetch_rows};
 
 use bytemuck::{Pod, Zeroable};
 use half::f16;

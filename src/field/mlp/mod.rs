@@ -193,10 +193,11 @@ impl Mlp {
         n: usize,
         outputs: usize,
     ) {
+        let ahead = a.to_next(a.first + n);
         let tile = &mut a.values[(a.first + n) * a.stride..][..a.end];
         match packed {
             Packed::Vector(packed) => {
-                packed.forward(simd, &self.layers, tile, outputs.next_multiple_of(BLOCK));
+                packed.forward(simd, &self.layers, tile, outputs.next_multiple_of(BLOCK), ahead);
             }
             Packed::Matrix(packed) => packed.forward(unit, &self.layers, tile, &mut a.saved, n),
         }
@@ -215,6 +216,7 @@ impl Mlp {
     pub fn backward<S: Simd>(&self, simd: S, unit: &Unit, packed: &Packed, a: &mut Activations, n: usize) {
         let last = n + 1 == a.tiles;
         a.latest = a.waiting;
+        let ahead = a.to_next(a.first + n);
         let grad = &mut a.grads[a.waiting * a.stride..][..a.end];
         let mut output = ColumnMut::new(simd, &mut grad[a.end - a.output..]);
         let [none, one, least] = [0.0, 1.0, LEAST_GRADIENT].map(|x| Floats::new(simd, x));
@@ -226,7 +228,7 @@ impl Mlp {
         match packed {
             Packed::Vector(packed) => {
                 let at = a.first + n;
-                packed.backward(simd, &self.layers, &a.values[at * a.stride..][..a.end], grad);
+                packed.backward(simd, &self.layers, &a.values[at * a.stride..][..a.end], grad, ahead);
                 a.waiting += 1;
                 // Those of a chunk that begins a strip may wait for the next chunk; others are not where it will be.
                 if a.waiting >= a.strip || last && a.waiting <= n {
@@ -356,6 +358,12 @@ impl Activations {
     #[inline(always)]
     pub fn input_grad(&self) -> &[f32] {
         &self.grads[self.latest * self.stride..][..self.input]
+    }
+
+    /// Floats from tile number `at` of those kept to the one behind it, if there is room for one.
+    #[inline(always)]
+    fn to_next(&self, at: usize) -> usize {
+        if (at + 2) * self.stride <= self.values.len() { self.stride } else { 0 }
     }
 
     /// Forgets gradients that nobody has asked for.

@@ -6,7 +6,7 @@
 use pulp::Simd;
 
 use super::{BLOCK, Layer, is_like_avx2};
-use crate::simd::{Finish, TILE, multiply, prefetch_rows};
+use crate::simd::{Finish, Product, TILE, multiply, prefetch_rows};
 
 /// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
 pub struct Packed {
@@ -36,9 +36,16 @@ impl Packed {
     }
 
     /// Fills all rows below the input of one tile, `[rows][TILE]`; of the output the first `outputs` (a multiple of
-    /// [`BLOCK`]).
+    /// [`BLOCK`]). Meanwhile the tile `ahead` floats behind it may be asked for.
     #[inline(always)]
-    pub(super) fn forward<S: Simd>(&self, simd: S, layers: &[Layer], tile: &mut [f32], outputs: usize) {
+    pub(super) fn forward<S: Simd>(
+        &self,
+        simd: S,
+        layers: &[Layer],
+        tile: &mut [f32],
+        outputs: usize,
+        ahead: usize,
+    ) {
         for (n, layer) in layers.iter().enumerate() {
             let n_out = if n + 1 < layers.len() { layer.n_out } else { outputs };
             if layer.again > 0 {
@@ -48,13 +55,22 @@ impl Packed {
             let w = &self.forward[layer.weight..][..layer.n_in * n_out];
             let bias = &self.bias[layer.bias..][..n_out];
             let finish = if n + 1 < layers.len() { Finish::Relu } else { Finish::Plain };
-            matmul(simd, w, bias, x, &mut y[..n_out * TILE], finish);
+            let ahead = y.as_ptr().wrapping_add(ahead);
+            matmul(simd, Product { w, bias, x, finish, ahead }, &mut y[..n_out * TILE]);
         }
     }
 
-    /// Fills the gradient rows of one tile above the output, whose rows the caller has set.
+    /// Fills the gradient rows of one tile above the output, whose rows the caller has set. Meanwhile the tile `ahead` floats behind
+    /// `tile` may be asked for.
     #[inline(always)]
-    pub(super) fn backward<S: Simd>(&self, simd: S, layers: &[Layer], tile: &[f32], grad: &mut [f32]) {
+    pub(super) fn backward<S: Simd>(
+        &self,
+        simd: S,
+        layers: &[Layer],
+        tile: &[f32],
+        grad: &mut [f32],
+        ahead: usize,
+    ) {
         for (n, layer) in layers.iter().enumerate().rev() {
             let (dx, dy) = grad[layer.row * TILE..].split_at_mut(layer.n_in * TILE);
             let w = &self.backward[layer.weight..][..layer.weights()];
@@ -63,9 +79,10 @@ impl Packed {
             let dy = &dy[..layer.n_out * TILE];
             let x = &tile[layer.row * TILE..][..layer.fresh() * TILE];
             let finish = if n > 0 { Finish::Where(x) } else { Finish::Plain };
-            matmul(simd, w, &[], dy, fresh, finish);
+            let product = Product { w, bias: &[], x: dy, finish, ahead: x.as_ptr().wrapping_add(ahead) };
+            matmul(simd, product, fresh);
             if layer.again > 0 {
-                matmul(simd, w_again, &[], dy, again, Finish::Plain);
+                matmul(simd, Product { w: w_again, finish: Finish::Plain, ..product }, again);
             }
         }
         for layer in layers.iter().filter(|l| l.again > 0) {
@@ -78,17 +95,17 @@ impl Packed {
     }
 }
 
-/// y = W x + b for one tile, finished; `w` is packed four outputs side by side.
+/// As [`multiply`], on any processor.
 #[inline(always)]
-fn matmul<S: Simd>(simd: S, w: &[f32], bias: &[f32], x: &[f32], y: &mut [f32], finish: Finish) {
+fn matmul<S: Simd>(simd: S, product: Product, y: &mut [f32]) {
     let vectors = TILE / S::F32_LANES;
     if is_like_avx2::<S>() {
-        multiply(w.as_chunks().0, bias.as_chunks().0, x, finish, y);
+        multiply(product, y);
     } else if S::REGISTER_COUNT < 32 && vectors.is_multiple_of(2) {
         // Sums that do not fit the registers would go through memory.
-        matmul_of::<S, 2>(simd, w, bias, x, y, finish);
+        matmul_of::<S, 2>(simd, product, y);
     } else {
-        matmul_of::<S, 3>(simd, w, bias, x, y, finish);
+        matmul_of::<S, 3>(simd, product, y);
     }
 }
 
@@ -100,14 +117,8 @@ fn bias_of(bias: &[f32], block: usize) -> [f32; BLOCK] {
 
 /// [`matmul`], `WIDE` vectors, of which a tile has some multiple, side by side.
 #[inline(always)]
-fn matmul_of<S: Simd, const WIDE: usize>(
-    simd: S,
-    w: &[f32],
-    bias: &[f32],
-    x: &[f32],
-    y: &mut [f32],
-    finish: Finish,
-) {
+fn matmul_of<S: Simd, const WIDE: usize>(simd: S, product: Product, y: &mut [f32]) {
+    let Product { w, bias, x, finish, .. } = product;
     let groups = TILE / S::F32_LANES / WIDE;
     let n_in = x.len() / TILE;
     let x = S::as_simd_f32s(x).0.as_chunks::<WIDE>().0;

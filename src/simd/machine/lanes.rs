@@ -86,9 +86,9 @@ pub fn keep(values: &mut [f32], layout: Layout, kept: &[u32], first: usize) {
 /// As [`keep`], eight lanes at a time.
 #[target_feature(enable = "avx2")]
 pub fn keep_eights(values: &mut [f32], layout: Layout, kept: &[u32], first: usize) {
-    for (n, kept) in kept.chunks(EIGHT).enumerate().skip(first / EIGHT) {
+    for (n, eight) in kept.chunks(EIGHT).enumerate().skip(first / EIGHT) {
         let to = layout.place(n * EIGHT);
-        let sources = Sources::<EIGHT>::of(layout, kept, to, values.len());
+        let sources = Sources::<EIGHT>::of(layout, eight, to, values.len());
         // SAFETY: as many numbers as are read.
         let lanes = unsafe { _mm256_loadu_si256(sources.lanes.as_ptr().cast()) };
         let bits = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
@@ -97,8 +97,11 @@ pub fn keep_eights(values: &mut [f32], layout: Layout, kept: &[u32], first: usiz
             let set = _mm256_and_si256(bits, _mm256_set1_epi32(part.lanes.into()));
             *mask = _mm256_castsi256_ps(_mm256_cmpeq_epi32(set, bits));
         }
+        // Rows lie far apart: the processor does not foresee what will be read.
+        let next = kept.get((n + 2) * EIGHT).map_or(to, |lane| layout.place(*lane as usize));
         for row in 0..layout.rows {
             let at = values.as_mut_ptr().wrapping_add(row * TILE);
+            _mm_prefetch::<_MM_HINT_T0>(at.wrapping_add(next).cast());
             let mut sum = _mm256_setzero_ps();
             for (part, mask) in sources.parts().iter().zip(&masks) {
                 // SAFETY: within the values, as `Sources::of` has asserted.
@@ -148,9 +151,11 @@ pub fn columns(rows: &[f32], width: usize, out: &mut [f32]) {
                 EIGHT => transposed::<EIGHT>(&rows[n..]),
                 _ => transposed::<4>(&rows[n..]),
             };
-            for (out, column) in out[n * width + j * EIGHT..].chunks_mut(width).zip(columns) {
-                // SAFETY: as many floats as are written.
-                unsafe { _mm256_storeu_ps(out[..EIGHT].as_mut_ptr(), column) };
+            let out = &mut out[n * width + j * EIGHT..];
+            assert!(out.len() >= (EIGHT - 1) * width + EIGHT);
+            for k in 0..EIGHT {
+                // SAFETY: as many floats as has been asserted.
+                unsafe { _mm256_storeu_ps(out.as_mut_ptr().add(k * width), columns[k]) };
             }
         }
     }

@@ -85,29 +85,44 @@ pub enum Finish<'a> {
     Where(&'a [f32]),
 }
 
-/// y = W x + b for one tile, finished: `w` is `[block][input][4]`, four outputs a block, `x` `[input][TILE]`, `y` `[4 block][TILE]`, and
-/// `bias` `[block][4]` or nothing; a fused multiply-add an input, of which there is a multiple of four. For processors with
-/// vectors of eight numbers and sixteen registers, of which compilers would keep some sums in memory.
+/// y = W x + b for one tile, finished.
+#[derive(Clone, Copy)]
+pub struct Product<'a> {
+    /// W `[block][input][4]`, four outputs a block.
+    pub w: &'a [f32],
+    /// b `[output]`, or nothing.
+    pub bias: &'a [f32],
+    /// x `[input][TILE]`.
+    pub x: &'a [f32],
+    /// What becomes of y.
+    pub finish: Finish<'a>,
+    /// As many rows as y has are asked for from here on meanwhile, since they are needed later; they may be anywhere.
+    pub ahead: *const f32,
+}
+
+/// Writes y `[output][TILE]`: a fused multiply-add an input, of which there is a multiple of four. For processors with vectors of
+/// eight numbers and sixteen registers, of which compilers would keep some sums in memory.
 #[inline(always)]
-pub fn multiply(w: &[[f32; 4]], bias: &[[f32; 4]], x: &[f32], finish: Finish, y: &mut [f32]) {
-    let (inputs, blocks) = (x.len() / TILE, y.len() / (4 * TILE));
-    assert!(inputs > 0 && inputs.is_multiple_of(4) && w.len() == inputs * blocks);
+pub fn multiply(product: Product, y: &mut [f32]) {
+    let Product { w, bias, x, .. } = product;
+    let (inputs, outputs) = (x.len() / TILE, y.len() / TILE);
+    assert!(inputs > 0 && inputs.is_multiple_of(4) && w.len() == inputs * outputs);
+    assert!(outputs.is_multiple_of(4) && (bias.is_empty() || bias.len() == outputs));
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx") && is_x86_feature_detected!("fma") {
         // SAFETY: this processor has the instructions.
-        return unsafe { products::multiply(w, bias, x, finish, y) };
+        return unsafe { products::multiply(product, y) };
     }
-    multiply_one_by_one(w, bias, x, finish, y);
+    multiply_one_by_one(product, y);
 }
 
-fn multiply_one_by_one(w: &[[f32; 4]], bias: &[[f32; 4]], x: &[f32], finish: Finish, y: &mut [f32]) {
+fn multiply_one_by_one(Product { w, bias, x, finish, .. }: Product, y: &mut [f32]) {
     let inputs = x.len() / TILE;
     for (at, y) in y.iter_mut().enumerate() {
-        let (row, n) = (at / TILE, at % TILE);
-        let (block, j) = (row / 4, row % 4);
-        let bias = bias.get(block).map_or(0.0, |b| b[j]);
-        let w = &w[block * inputs..][..inputs];
-        let sum = w.iter().zip(x.chunks_exact(TILE)).fold(bias, |sum, (w, x)| w[j].mul_add(x[n], sum));
+        let (output, n) = (at / TILE, at % TILE);
+        let w = w[output / 4 * 4 * inputs..][..4 * inputs].iter().skip(output % 4).step_by(4);
+        let bias = bias.get(output).copied().unwrap_or_default();
+        let sum = w.zip(x.chunks_exact(TILE)).fold(bias, |sum, (w, x)| w.mul_add(x[n], sum));
         *y = match finish {
             Finish::Plain => sum,
             Finish::Relu => sum.max(0.0),
@@ -157,15 +172,14 @@ mod tests {
         for (inputs, blocks) in [(4, 1), (8, 3), (64, 2)] {
             let mut rng = Rng::new(inputs as u64, 0, 0);
             let mut number = move || rng.uniform() - 0.5;
-            let w: Vec<[f32; 4]> = (0..inputs * blocks).map(|_| std::array::from_fn(|_| number())).collect();
-            let bias: Vec<[f32; 4]> = (0..blocks).map(|_| std::array::from_fn(|_| number())).collect();
-            let [x, rows] =
-                [inputs, 4 * blocks].map(|n| (0..n * TILE).map(|_| number()).collect::<Vec<f32>>());
+            let [w, bias, x, rows] = [4 * inputs * blocks, 4 * blocks, inputs * TILE, 4 * blocks * TILE]
+                .map(|n| (0..n).map(|_| number()).collect::<Vec<f32>>());
             for finish in [Finish::Plain, Finish::Relu, Finish::Where(&rows)] {
                 for bias in [&bias[..], &[]] {
+                    let product = Product { w: &w, bias, x: &x, finish, ahead: std::ptr::null() };
                     let [mut fast, mut slow] = [(); 2].map(|()| vec![2.0; 4 * blocks * TILE]);
-                    multiply(&w, bias, &x, finish, &mut fast);
-                    multiply_one_by_one(&w, bias, &x, finish, &mut slow);
+                    multiply(product, &mut fast);
+                    multiply_one_by_one(product, &mut slow);
                     assert_eq!(fast, slow);
                 }
             }

@@ -1,17 +1,25 @@
 //! Products of small matrices with as many sums as AVX2 has registers for, of which compilers keep some in memory.
 
 use std::arch::asm;
-use std::arch::x86_64::*;
+use std::arch::x86_64::__m256;
 
-use super::{Finish, TILE, prefetch_rows};
+use super::{Finish, Product, TILE};
 
-/// Numbers of a vector.
-const LANES: usize = 8;
-
-/// Samples of a tile that are multiplied at a time.
+/// Samples of a tile that are multiplied at a time: three vectors of eight.
 const WIDTH: usize = TILE / 2;
 
-/// Adds to the three sums of output `j` of `{a0}` to `{d2}` its weight of input number `k` times the input's vectors.
+/// The three sums of output `j` of a block, `{a0}` to `{d2}`, begin with its bias.
+macro_rules! begin {
+    ($j:literal, $sums:literal) => {
+        concat!(
+            concat!("vbroadcastss {", $sums, "0}, [{bias} + 4 * ", $j, "]\n"),
+            concat!("vmovaps {", $sums, "1}, {", $sums, "0}\n"),
+            concat!("vmovaps {", $sums, "2}, {", $sums, "0}\n"),
+        )
+    };
+}
+
+/// Adds to the three sums of output `j` its weight of input number `k` of a round times the input's vectors.
 macro_rules! output {
     ($k:literal, $j:literal, $sums:literal) => {
         concat!(
@@ -27,9 +35,9 @@ macro_rules! output {
 macro_rules! input {
     ($k:literal) => {
         concat!(
-            concat!("vmovups {x0}, [{x} + 192 * ", $k, "]\n"),
-            concat!("vmovups {x1}, [{x} + 192 * ", $k, " + 32]\n"),
-            concat!("vmovups {x2}, [{x} + 192 * ", $k, " + 64]\n"),
+            concat!("vmovups {x0}, [{at} + 192 * ", $k, "]\n"),
+            concat!("vmovups {x1}, [{at} + 192 * ", $k, " + 32]\n"),
+            concat!("vmovups {x2}, [{at} + 192 * ", $k, " + 64]\n"),
             output!($k, 0, "a"),
             output!($k, 1, "b"),
             output!($k, 2, "c"),
@@ -38,95 +46,155 @@ macro_rules! input {
     };
 }
 
-/// As [`super::multiply`], which has asserted that all lengths fit.
-#[target_feature(enable = "avx,fma")]
-pub fn multiply(w: &[[f32; 4]], bias: &[[f32; 4]], x: &[f32], finish: Finish, y: &mut [f32]) {
-    let inputs = x.len() / TILE;
-    for first in [0, WIDTH] {
-        for (block, (w, y)) in w.chunks_exact(inputs).zip(y.chunks_exact_mut(4 * TILE)).enumerate() {
-            let at = block * 4 * TILE + first;
-            // There are more tiles in a chunk than a near cache holds.
-            prefetch_rows::<[f32; WIDTH]>(y[first..].as_chunks().0, 0, TILE / WIDTH);
-            let finish = match finish {
-                Finish::Where(rows) => Finish::Where(&rows[at..]),
-                other => other,
-            };
-            if let Finish::Where(rows) = finish {
-                prefetch_rows::<[f32; WIDTH]>(rows.as_chunks().0, 0, TILE / WIDTH);
-            }
-            products(w, bias.get(block).copied().unwrap_or_default(), &x[first..], finish, &mut y[first..]);
-        }
-    }
+/// Asks for half of a block's rows at `{ahead}`, each of which is in two cache lines.
+macro_rules! ask {
+    ($row:literal) => {
+        concat!(
+            concat!("prefetcht0 [{ahead} + 192 * ", $row, "]\n"),
+            concat!("prefetcht0 [{ahead} + 192 * ", $row, " + 64]\n"),
+        )
+    };
+    () => {
+        concat!(ask!(0), ask!(1), ask!(2), ask!(3), "add {ahead}, 768\n")
+    };
 }
 
-/// Half a tile of four outputs.
-#[inline]
-#[target_feature(enable = "avx,fma")]
-fn products(w: &[[f32; 4]], bias: [f32; 4], x: &[f32], finish: Finish, y: &mut [f32]) {
-    const { assert!(TILE * size_of::<f32>() == 192 && WIDTH == 3 * LANES) };
-    let rounds = w.len() / 4;
-    assert!(rounds > 0 && x.len() >= (4 * rounds - 1) * TILE + WIDTH);
-    let [mut a0, mut b0, mut c0, mut d0] = bias.map(|b| _mm256_set1_ps(b));
-    let [[mut a1, mut b1, mut c1, mut d1], [mut a2, mut b2, mut c2, mut d2]] = [[a0, b0, c0, d0]; 2];
-    // SAFETY: reads four weights of each of four inputs a round, and of each input as many numbers as have been asserted.
-    unsafe {
+/// Writes vector `v` of the sums of output `j`.
+macro_rules! plain {
+    ($j:literal, $sums:literal, $v:literal) => {
+        concat!("vmovups [{y} + 192 * ", $j, " + 32 * ", $v, "], {", $sums, $v, "}\n")
+    };
+}
+
+/// Likewise, negative ones as 0, which `{f}` is.
+macro_rules! relu {
+    ($j:literal, $sums:literal, $v:literal) => {
+        concat!(concat!("vmaxps {", $sums, $v, "}, {", $sums, $v, "}, {f}\n"), plain!($j, $sums, $v),)
+    };
+}
+
+/// Likewise, where 0 is less than `{rows}` (predicate 17).
+macro_rules! masked {
+    ($j:literal, $sums:literal, $v:literal) => {
+        concat!(
+            concat!("vcmpps {x", $v, "}, {f}, [{rows} + 192 * ", $j, " + 32 * ", $v, "], 17\n"),
+            concat!("vandps {", $sums, $v, "}, {", $sums, $v, "}, {x", $v, "}\n"),
+            plain!($j, $sums, $v),
+        )
+    };
+}
+
+/// Finishes the sums of output `j`.
+macro_rules! finish {
+    ($each:ident, $j:literal, $sums:literal) => {
+        concat!($each!($j, $sums, 0), $each!($j, $sums, 1), $each!($j, $sums, 2))
+    };
+}
+
+/// Half a tile of all blocks of outputs, finished by the macro `$each`; `$next` and `$rows` are for rows by which it does so.
+macro_rules! half_tile {
+    ($half:expr, $each:ident, $next:literal, $($rows:tt)*) => {{
+        let Half { w, bias, x, y, rounds, blocks, ahead } = $half;
         asm!(
             "2:",
+            begin!(0, "a"),
+            begin!(1, "b"),
+            begin!(2, "c"),
+            begin!(3, "d"),
+            ask!(),
+            "mov {at}, {x}",
+            "mov {left}, {rounds}",
+            "3:",
             input!(0),
             input!(1),
             input!(2),
             input!(3),
-            "add {x}, 768",
+            "add {at}, 768",
             "add {w}, 64",
-            "cmp {w}, {end}",
+            "dec {left}",
+            "jne 3b",
+            "vxorps {f}, {f}, {f}",
+            finish!($each, 0, "a"),
+            finish!($each, 1, "b"),
+            finish!($each, 2, "c"),
+            finish!($each, 3, "d"),
+            "add {bias}, {bias_step}",
+            "add {y}, 768",
+            $next,
+            "dec {blocks}",
             "jne 2b",
-            x = inout(reg) x.as_ptr() => _,
-            w = inout(reg) w.as_ptr() => _,
-            end = in(reg) w.as_ptr().wrapping_add(4 * rounds),
-            a0 = inout(ymm_reg) a0, a1 = inout(ymm_reg) a1, a2 = inout(ymm_reg) a2,
-            b0 = inout(ymm_reg) b0, b1 = inout(ymm_reg) b1, b2 = inout(ymm_reg) b2,
-            c0 = inout(ymm_reg) c0, c1 = inout(ymm_reg) c1, c2 = inout(ymm_reg) c2,
-            d0 = inout(ymm_reg) d0, d1 = inout(ymm_reg) d1, d2 = inout(ymm_reg) d2,
+            $($rows)*
+            w = inout(reg) w => _,
+            x = in(reg) x,
+            y = inout(reg) y => _,
+            ahead = inout(reg) ahead => _,
+            bias = inout(reg) bias.0 => _,
+            bias_step = in(reg) bias.1,
+            rounds = in(reg) rounds,
+            blocks = inout(reg) blocks => _,
+            at = out(reg) _,
+            left = out(reg) _,
+            a0 = out(ymm_reg) _, a1 = out(ymm_reg) _, a2 = out(ymm_reg) _,
+            b0 = out(ymm_reg) _, b1 = out(ymm_reg) _, b2 = out(ymm_reg) _,
+            c0 = out(ymm_reg) _, c1 = out(ymm_reg) _, c2 = out(ymm_reg) _,
+            d0 = out(ymm_reg) _, d1 = out(ymm_reg) _, d2 = out(ymm_reg) _,
             x0 = out(ymm_reg) _, x1 = out(ymm_reg) _, x2 = out(ymm_reg) _, f = out(ymm_reg) _,
-            options(readonly, nostack),
+            options(nostack),
         );
+    }};
+}
+
+/// What half a tile is made of.
+struct Half {
+    /// Weights, four of each input, block after block.
+    w: *const f32,
+    /// Biases of the first block, and bytes to those of the next.
+    bias: (*const f32, usize),
+    /// The half's first number of the first input, and of the first output.
+    x: *const f32,
+    y: *mut f32,
+    /// Fours of inputs, and of outputs; at least one each.
+    rounds: usize,
+    blocks: usize,
+    /// What is asked for, four rows a block.
+    ahead: *const f32,
+}
+
+/// As [`super::multiply`], which has asserted that all lengths fit.
+#[target_feature(enable = "avx,fma")]
+pub fn multiply(Product { w, bias, x, finish, ahead }: Product, y: &mut [f32]) {
+    const { assert!(TILE * size_of::<f32>() == 192 && WIDTH * size_of::<f32>() == 3 * size_of::<__m256>()) };
+    static NO_BIAS: [f32; 4] = [0.0; 4];
+    let (rounds, blocks) = (x.len() / TILE / 4, y.len() / TILE / 4);
+    if blocks == 0 {
+        return;
     }
-    let sums = [[a0, a1, a2], [b0, b1, b2], [c0, c1, c2], [d0, d1, d2]];
-    let zero = _mm256_setzero_ps();
-    // One short path for each way to finish: all sums stay in registers.
-    match finish {
-        Finish::Plain => store(sums, y),
-        Finish::Relu => store(sums.map(|row| row.map(|sum| _mm256_max_ps(sum, zero))), y),
-        Finish::Where(rows) => {
-            let mut kept = sums;
-            for (n, row) in kept.iter_mut().enumerate() {
-                for (sum, x) in row.iter_mut().zip(load(&rows[n * TILE..])) {
-                    *sum = _mm256_and_ps(*sum, _mm256_cmp_ps::<_CMP_GT_OQ>(x, zero));
+    for first in [0, WIDTH] {
+        let half = Half {
+            w: w.as_ptr(),
+            bias: if bias.is_empty() {
+                (NO_BIAS.as_ptr(), 0)
+            } else {
+                (bias.as_ptr(), size_of_val(&NO_BIAS))
+            },
+            x: x[first..].as_ptr(),
+            y: y[first..].as_mut_ptr(),
+            rounds,
+            blocks,
+            ahead: ahead.wrapping_add(first),
+        };
+        // SAFETY: reads the weights of as many inputs and outputs as has been asserted, those inputs, and no or as many biases;
+        // writes those outputs. What is asked for ahead may be anywhere.
+        unsafe {
+            match finish {
+                Finish::Plain => half_tile!(half, plain, "",),
+                Finish::Relu => half_tile!(half, relu, "",),
+                Finish::Where(rows) => {
+                    // As many rows as of the output.
+                    let rows = rows[..y.len()][first..].as_ptr();
+                    half_tile!(half, masked, "add {rows}, 768", rows = inout(reg) rows => _,);
                 }
             }
-            store(kept, y);
-        }
-    }
-}
-
-#[inline]
-#[target_feature(enable = "avx")]
-fn load(row: &[f32]) -> [__m256; 3] {
-    let at = row[..WIDTH].as_ptr();
-    // SAFETY: as many floats as are read.
-    unsafe { [_mm256_loadu_ps(at), _mm256_loadu_ps(at.add(LANES)), _mm256_loadu_ps(at.add(2 * LANES))] }
-}
-
-#[inline]
-#[target_feature(enable = "avx")]
-fn store(rows: [[__m256; 3]; 4], y: &mut [f32]) {
-    for (n, row) in rows.into_iter().enumerate() {
-        let at = y[n * TILE..][..WIDTH].as_mut_ptr();
-        // SAFETY: as many floats as are written.
-        unsafe {
-            _mm256_storeu_ps(at, row[0]);
-            _mm256_storeu_ps(at.add(LANES), row[1]);
-            _mm256_storeu_ps(at.add(2 * LANES), row[2]);
         }
     }
 }
