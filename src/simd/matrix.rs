@@ -118,37 +118,42 @@ impl Unit {
     }
 }
 
+#[inline(always)]
 fn panel(a: &[u16], b: &[Pairs], c: &mut [f32]) {
-    for row in 0..TILE_ROWS {
-        let c = &mut c[row * PANEL..][..PANEL];
-        c.fill(0.0);
+    for (row, c) in c.as_chunks_mut::<PANEL>().0.iter_mut().take(TILE_ROWS).enumerate() {
+        *c = [0.0; PANEL];
         for (a, b) in a.chunks_exact(TILE_ROWS * TILE_DEPTH).zip(b.chunks_exact(TILE_ROWS * PANEL)) {
-            let a = &a[row * TILE_DEPTH..][..TILE_DEPTH];
-            for (a, b) in a.chunks_exact(2).zip(b.chunks_exact(PANEL)) {
-                let a = [widen(a[0]), widen(a[1])];
-                for (c, b) in c.iter_mut().zip(b) {
-                    *c += a[0] * widen(*b as u16) + a[1] * widen((*b >> 16) as u16);
-                }
-            }
+            add_pairs(&a[row * TILE_DEPTH..][..TILE_DEPTH], b.as_chunks().0, c);
         }
     }
 }
 
+#[inline(always)]
 fn outer(a: &[u16], a_stride: usize, b: [&[Pairs]; 2], blocks: usize, c: &mut [[f32; 256]; 4]) {
     for (n, c) in c.iter_mut().enumerate() {
-        c.fill(0.0);
-        for (row, c) in c.chunks_exact_mut(16).enumerate() {
+        for (row, c) in c.as_chunks_mut::<TILE_ROWS>().0.iter_mut().enumerate() {
+            *c = [0.0; TILE_ROWS];
             let a = &a[(n / 2 * TILE_ROWS + row) * a_stride..][..blocks * TILE_DEPTH];
-            for (a, b) in a.chunks_exact(2).zip(b[n % 2].chunks_exact(16)) {
-                let a = [widen(a[0]), widen(a[1])];
-                for (c, b) in c.iter_mut().zip(b) {
-                    *c += a[0] * widen(*b as u16) + a[1] * widen((*b >> 16) as u16);
-                }
-            }
+            add_pairs(a, b[n % 2].as_chunks().0, c);
         }
     }
 }
 
+/// Adds the product of a row of the left operand and rows of pairs of the right one to `c`.
+#[inline(always)]
+fn add_pairs<const COLUMNS: usize>(a: &[u16], b: &[[Pairs; COLUMNS]], c: &mut [f32; COLUMNS]) {
+    // A copy stays in registers.
+    let mut sums = *c;
+    for (a, b) in a.as_chunks::<2>().0.iter().zip(b) {
+        let a = a.map(widen);
+        for n in 0..COLUMNS {
+            sums[n] += a[0] * widen(b[n] as u16) + a[1] * widen((b[n] >> 16) as u16);
+        }
+    }
+    *c = sums;
+}
+
+#[inline(always)]
 fn narrow_rows(rows: &[f32; 2 * PANEL], bias: [f32; 2], keep: Keep, out: Narrowed) {
     let Narrowed { pairs, rows: to } = out;
     for lane in 0..PANEL {
@@ -181,6 +186,7 @@ pub fn widen(x: u16) -> f32 {
 }
 
 /// Transposes 16 × 16 pairs.
+#[inline(always)]
 fn transpose(rows: &[Pairs], stride: usize, out: &mut [Pairs; 256]) {
     for (column, out) in out.chunks_exact_mut(16).enumerate() {
         for (row, out) in out.iter_mut().enumerate() {
