@@ -74,6 +74,9 @@ pub struct TrainingState {
     /// Share of pixels whose depth stereo found from the given poses, in a few frames; `None` before that was asked.
     #[serde(default)]
     pub given_coverage: Option<f64>,
+    /// How many frames those were at most, where that is known.
+    #[serde(default)]
+    pub judged: Option<usize>,
     /// Pose refinement and rig from which depth was looked for by stereo; `None` before it was.
     pub stereo_from: Option<Vec<f32>>,
     /// Seconds that stereo would have taken, where that was too much of a time budget; `None` where it was not left out.

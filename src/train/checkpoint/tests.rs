@@ -39,6 +39,7 @@ fn random(seed: u64) -> (Trained, Optimiser) {
         prepared: 0.5,
         trusts_poses: true,
         given_coverage: Some(0.25),
+        judged: Some(12),
         stereo_left_out: Some(0.75),
         stereo_from: Some((0..field.layout.refinement().len()).map(|n| 1.5e-3 * n as f32).collect()),
     };

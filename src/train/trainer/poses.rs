@@ -10,8 +10,8 @@ use crate::stereo::Search;
 use crate::train::align;
 use crate::train::checkpoint::Trained;
 
-/// Frames by which poses are judged.
-const JUDGED_FRAMES: usize = 12;
+/// Frames by which poses are judged, and those of them that are looked at first.
+const JUDGED_FRAMES: [usize; 2] = [4, 12];
 
 /// Share of a time budget that stereo may take where nothing moves: in a short one, that many more steps are worth more,
 /// for the picture and for the surface.
@@ -19,6 +19,9 @@ const STEREO_SHARE: f64 = 0.1;
 
 /// Share of their pixels of which stereo finds the depth, from where poses need no refinement.
 const WELL_POSED: f64 = 0.2;
+
+/// Where the first few frames have less, more of them would not change the verdict.
+const ILL_POSED: f64 = 0.1;
 
 impl Trainer {
     /// Registers all training frames to what the field shows from where they are.
@@ -40,27 +43,34 @@ impl Trainer {
             return;
         }
         let refined = !train.align_at.is_empty() || train.pose_rate > 0.0 || train.rig_rate > 0.0;
-        let judged = self.judged_frames();
-        let Trained { field, progress, .. } = &mut self.trained;
         let start = Instant::now();
-        let search = self.pixels.stereo_search(field, stereo);
-        progress.given_coverage = refined.then(|| search.coverage(&judged));
+        let search = self.pixels.stereo_search(&self.trained.field, stereo);
+        let given = refined.then(|| self.judge(&search));
         // Frames are judged together with those that they are compared with.
-        let frames = self.pixels.frames.len();
-        let looked_at = (judged.len() * (1 + stereo.neighbours)).min(frames).max(1);
+        let (frames, judged) = (self.pixels.frames.len(), given.map_or(0, |(_, judged)| judged));
+        let looked_at = (judged * (1 + stereo.neighbours)).min(frames).max(1);
         // Refined poses are judged once more.
         let times = 1.0 + frames as f64 / looked_at as f64;
         self.stereo_cost = refined.then(|| start.elapsed().as_secs_f64() * times);
+        let progress = &mut self.trained.progress;
+        (progress.given_coverage, progress.judged) = given.unzip();
         progress.trusts_poses = progress.given_coverage.is_none_or(|share| share >= WELL_POSED);
         if progress.trusts_poses {
             self.find_depth(Some(search));
         }
     }
 
-    /// A few training frames, evenly over the video.
-    fn judged_frames(&self) -> Vec<usize> {
+    /// Share of some frames' pixels whose depth is found, and how many those frames are at most: few if they tell enough.
+    fn judge(&self, search: &Search) -> (f64, usize) {
+        let [few, more] = JUDGED_FRAMES;
+        let share = search.coverage(&self.judged_frames(few));
+        if share < ILL_POSED { (share, few) } else { (search.coverage(&self.judged_frames(more)), more) }
+    }
+
+    /// A few training frames, `count` at most, evenly over the video.
+    fn judged_frames(&self, count: usize) -> Vec<usize> {
         let frames = self.pixels.frames.len();
-        (0..frames).step_by(frames.div_ceil(JUDGED_FRAMES).max(1)).collect()
+        (0..frames).step_by(frames.div_ceil(count).max(1)).collect()
     }
 
     /// Whether depth by stereo has to wait, because it takes too much of a time budget: until it is known whether anything
@@ -115,7 +125,7 @@ impl Trainer {
     /// the search that has told so goes on.
     pub(super) fn settle_poses(&mut self) -> Option<Search> {
         let given = self.trained.progress.given_coverage.filter(|_| !self.trained.progress.trusts_poses)?;
-        let judged = self.judged_frames();
+        let judged = self.judged_frames(self.trained.progress.judged.unwrap_or(JUDGED_FRAMES[1]));
         let Trained { field, progress, .. } = &mut self.trained;
         let search = self.pixels.stereo_search(field, &self.config.stereo);
         let refined = search.coverage(&judged);

@@ -181,6 +181,18 @@ fn a_refinement_from_which_stereo_finds_less_is_undone() {
 }
 
 #[test]
+fn poses_that_are_clearly_bad_are_judged_by_few_frames() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    let mut trainer = Trainer::new(&scene, &config(0.3)).expect("the test's scene is valid");
+    // Of pictures without any texture, stereo finds nothing.
+    trainer.pixels.images.iter_mut().flatten().for_each(|rgb| *rgb = [90; 3]);
+    trainer.judge_poses();
+    let progress = &trainer.trained.progress;
+    assert_eq!((progress.given_coverage, progress.judged, progress.trusts_poses), (Some(0.0), Some(4), false));
+}
+
+#[test]
 fn trusted_poses_are_not_refined() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let scene = testing::scene(folder.path());
