@@ -24,6 +24,8 @@ use divff::synth::{self, SynthOptions};
 use divff::train::step::StepReport;
 use divff::train::{TrainError, Trainer};
 
+#[path = "../tests/support/data.rs"]
+mod data;
 mod machine;
 use machine::{LEVEL_ROWS, Machine};
 
@@ -181,13 +183,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
 /// The scene that is trained.
 fn scene_folder(own: &Path) -> Result<PathBuf, Box<dyn std::error::Error>> {
-    let data = std::env::var_os("DIVFF_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
-    let kitchen = data.join("kitchen-a");
-    if kitchen.exists() {
+    if let Some(kitchen) = data::scene("kitchen-a") {
         return Ok(kitchen);
     }
-    eprintln!("no kitchen-a in {}: a synthetic scene instead; set DIVFF_DATA", data.display());
+    eprintln!("training a synthetic scene instead");
     let scene = own.join("scene");
     synth::generate(&SynthOptions::default(), &scene)?;
     Ok(scene)

@@ -1,13 +1,16 @@
 //! Pick and place: that something moves is found out, and what is moved where it is at that time, and not where it was.
 
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use divff::config::{Config, Preset};
 use divff::pipeline::{self, Cost, Event, Observer, RunFolder};
 use divff::scene::{Scene, Split};
 use divff::synth::{SynthOptions, generate};
 use divff::train::{Progress, Trainer};
+
+#[path = "support/data.rs"]
+mod data;
 
 /// Nobody listens.
 struct Quiet;
@@ -92,27 +95,15 @@ fn on_the_synthetic_kitchen() {
     found(&path, &settings(1400)).check();
 }
 
-/// A folder of the real and rendered scenes; says so where it is not there.
-fn data(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("DIVFF_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
-    let path = root.join(name);
-    if !path.is_dir() {
-        eprintln!("SKIPPED: no {name} in {}; set DIVFF_DATA to run this test", root.display());
-        return None;
-    }
-    Some(path)
-}
-
 #[test]
 fn on_the_rendered_kitchen() {
-    let Some(path) = data("kitchen-a") else { return };
+    let Some(path) = data::scene("kitchen-a") else { return };
     found(&path, &settings(2000)).check();
 }
 
 #[test]
 fn where_nothing_moves_there_are_no_streams_for_it() {
-    let Some(path) = data("redkitchen") else { return };
+    let Some(path) = data::scene("redkitchen") else { return };
     let run = tempfile::tempdir().unwrap();
     let scene = Scene::open(&path).unwrap();
     let mut trainer = Trainer::new(&scene, &Config::preset(Preset::Draft)).unwrap();

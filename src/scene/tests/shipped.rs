@@ -1,26 +1,16 @@
 //! The data sets that come with the project, where they are there.
 
-use std::path::PathBuf;
-
 use glam::{DVec2, DVec3};
 
 use super::super::{Aabb, Scene, Split, inspect};
 
-fn data(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("DIVFF_DATA").map(PathBuf::from);
-    let root = root.unwrap_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"));
-    let folder = root.join(name);
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    eprintln!("SKIPPED: no {name} in the data folder; set DIVFF_DATA to run this test");
-    None
-}
+#[path = "../../../tests/support/data.rs"]
+mod data;
 
 #[test]
 fn shipped_scenes_open_with_their_splits() {
     for (name, train, test) in [("redkitchen", 175, 25), ("kitchen-a", 210, 30)] {
-        let Some(folder) = data(name) else { continue };
+        let Some(folder) = data::scene(name) else { continue };
         let scene = Scene::open(&folder).unwrap();
         let count = |split| scene.frames.iter().filter(|f| f.split == split).count();
         assert_eq!((count(Split::Train), count(Split::Test)), (train, test), "{name}");
@@ -54,7 +44,7 @@ fn share_inside(scene: &Scene, bounds: &Aabb) -> f64 {
 fn depth_of_shipped_scenes_lies_in_their_bounds() {
     // Poses, axes, depth and box only fit together if every convention is right.
     for name in ["redkitchen", "kitchen-a"] {
-        let Some(folder) = data(name) else { continue };
+        let Some(folder) = data::scene(name) else { continue };
         let scene = Scene::open(&folder).unwrap();
         let slack = DVec3::splat(0.02);
         let wider = Aabb { min: scene.bounds.min - slack, max: scene.bounds.max + slack };
@@ -66,7 +56,7 @@ fn depth_of_shipped_scenes_lies_in_their_bounds() {
 #[test]
 fn bounds_guessed_from_the_cameras_hold_what_they_see() {
     for name in ["redkitchen", "kitchen-a"] {
-        let Some(folder) = data(name) else { continue };
+        let Some(folder) = data::scene(name) else { continue };
         let mut draft = super::super::open::read(&folder).unwrap();
         let given = draft.aabb.take().unwrap();
         let scene = super::super::assemble::assemble(draft).unwrap();
@@ -81,7 +71,7 @@ fn bounds_guessed_from_the_cameras_hold_what_they_see() {
 #[test]
 fn shipped_scenes_have_no_problems() {
     for name in ["redkitchen", "kitchen-a"] {
-        let Some(folder) = data(name) else { continue };
+        let Some(folder) = data::scene(name) else { continue };
         let report = inspect(&Scene::open(&folder).unwrap(), true);
         assert_eq!(report.problems, Vec::<String>::new(), "{name}");
         println!("{report}");
@@ -90,7 +80,7 @@ fn shipped_scenes_have_no_problems() {
 
 #[test]
 fn the_features_of_kitchen_a_are_read_without_a_complaint() {
-    let Some(folder) = data("kitchen-a") else { return };
+    let Some(folder) = data::scene("kitchen-a") else { return };
     let scene = Scene::open(&folder).unwrap();
     let inspection = inspect(&scene, true);
     assert!(inspection.problems.is_empty(), "{:?}", inspection.problems);
