@@ -189,7 +189,10 @@ fn poses_that_are_clearly_bad_are_judged_by_few_frames() {
     trainer.pixels.images.iter_mut().flatten().for_each(|rgb| *rgb = [90; 3]);
     trainer.judge_poses();
     let progress = &trainer.trained.progress;
-    assert_eq!((progress.given_coverage, progress.judged, progress.trusts_poses), (Some(0.0), Some(4), false));
+    assert_eq!(
+        (progress.given_coverage, progress.judged, progress.trusts_poses),
+        (Some(0.0), Some(4), false)
+    );
 }
 
 #[test]
