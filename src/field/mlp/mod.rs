@@ -193,8 +193,9 @@ impl Mlp {
         n: usize,
         outputs: usize,
     ) {
-        let ahead = a.to_next(a.first + n);
-        let tile = &mut a.values[(a.first + n) * a.stride..][..a.end];
+        let at = a.first + n;
+        let ahead = a.to_next(at);
+        let tile = &mut a.values[at * a.stride..][..a.end];
         match packed {
             Packed::Vector(packed) => {
                 packed.forward(simd, &self.layers, tile, outputs.next_multiple_of(BLOCK), ahead);
@@ -216,7 +217,8 @@ impl Mlp {
     pub fn backward<S: Simd>(&self, simd: S, unit: &Unit, packed: &Packed, a: &mut Activations, n: usize) {
         let last = n + 1 == a.tiles;
         a.latest = a.waiting;
-        let ahead = a.to_next(a.first + n);
+        let at = a.first + n;
+        let ahead = a.to_next(at);
         let grad = &mut a.grads[a.waiting * a.stride..][..a.end];
         let mut output = ColumnMut::new(simd, &mut grad[a.end - a.output..]);
         let [none, one, least] = [0.0, 1.0, LEAST_GRADIENT].map(|x| Floats::new(simd, x));
@@ -227,7 +229,6 @@ impl Mlp {
         }
         match packed {
             Packed::Vector(packed) => {
-                let at = a.first + n;
                 packed.backward(simd, &self.layers, &a.values[at * a.stride..][..a.end], grad, ahead);
                 a.waiting += 1;
                 // Those of a chunk that begins a strip may wait for the next chunk; others are not where it will be.

@@ -56,11 +56,9 @@ fn of_panel<S: Simd, const WIDE: usize>(simd: S, n_in: usize, x: TileView, panel
     let (weights, bias) = S::as_mut_simd_f32s(out).0.as_chunks_mut::<WIDE>().0.split_at_mut(n_in);
     let mut i = 0;
     while i < n_in {
-        // A single vector of outputs leaves registers for twice as many inputs.
-        let wide = if WIDE == 1 && n_in - i >= 12 { 12 } else { inputs_together(n_in - i) };
+        let wide = inputs_together(n_in - i);
         let (x, weights) = (x.rows(i), &mut weights[i..i + wide]);
         match wide {
-            12 if WIDE == 1 => products::<S, WIDE, 12>(simd, x, panel, weights),
             6 => products::<S, WIDE, 6>(simd, x, panel, weights),
             4 => products::<S, WIDE, 4>(simd, x, panel, weights),
             _ => products::<S, WIDE, 2>(simd, x, panel, weights),
