@@ -79,31 +79,28 @@ fn outer_product<S: Simd, const WIDE: usize>(
     count: usize,
     out: &mut [Partial],
 ) {
+    let mut sums = [[simd.splat_f32s(0.0); BLOCK]; WIDE];
     if S::REGISTER_COUNT < 32 {
-        let (first, second) = (
-            outputs_by_inputs::<S, 2, WIDE>(simd, dy, x, count),
-            outputs_by_inputs::<S, 2, WIDE>(simd, dy.rows(2), x, count),
-        );
-        let mut acc = [[simd.splat_f32s(0.0); BLOCK]; WIDE];
-        for k in 0..WIDE {
-            acc[k] = [first[k][0], first[k][1], second[k][0], second[k][1]];
-        }
-        add_sums::<S, _>(&acc, out);
+        outputs_by_inputs::<S, 2, WIDE>(simd, dy, x, count, 0, &mut sums);
+        outputs_by_inputs::<S, 2, WIDE>(simd, dy.rows(2), x, count, 2, &mut sums);
     } else {
-        let sums = outputs_by_inputs::<S, BLOCK, WIDE>(simd, dy, x, count);
-        add_sums::<S, _>(&sums, out);
+        outputs_by_inputs::<S, BLOCK, WIDE>(simd, dy, x, count, 0, &mut sums);
     }
+    add_sums::<S, _>(&sums, out);
 }
 
-/// Σ over samples of dy[j] x[k], `[k][j]`, but for the sum over lanes.
+/// Σ over samples of dy[j] x[k], but for the sum over lanes, as `out[k][first + j]`.
 #[inline(always)]
 fn outputs_by_inputs<S: Simd, const OUTPUTS: usize, const INPUTS: usize>(
     simd: S,
     dy: TileView,
     x: TileView,
     count: usize,
-) -> [[S::f32s; OUTPUTS]; INPUTS] {
+    first: usize,
+    out: &mut [[S::f32s; BLOCK]; INPUTS],
+) {
     let vectors = TILE / S::F32_LANES;
+    // Sums of its own and no one else's stay in registers.
     let mut acc = [[simd.splat_f32s(0.0); OUTPUTS]; INPUTS];
     for tile in 0..count {
         let dy = S::as_simd_f32s(dy.of(tile, OUTPUTS)).0;
@@ -121,7 +118,11 @@ fn outputs_by_inputs<S: Simd, const OUTPUTS: usize, const INPUTS: usize>(
             }
         }
     }
-    acc
+    for k in 0..INPUTS {
+        for j in 0..OUTPUTS {
+            out[k][first + j] = acc[k][j];
+        }
+    }
 }
 
 /// Adds Σ over samples of dy[j] to `out`.
