@@ -1,8 +1,8 @@
 //! A training step beside the least time that this machine allows for it.
 //!
 //! `cargo bench --bench step`. Trains `kitchen-a` from the data folder (`$DIVFF_DATA`, else `../shared/data`), or a scene of its
-//! own where that is absent, on the standard schedule or one of `DIVFF_STEPS` steps, and looks at some steps of each part of it:
-//! at first everything is evaluated, at the end only what is at surfaces.
+//! own where that is absent, on the standard schedule or one of `DIVFF_STEPS` steps, with products in `DIVFF_PRECISION` (`auto`, `f32`
+//! or `bf16`), and looks at some steps of each part of it: at first everything is evaluated, at the end only what is at surfaces.
 //!
 //! The floor counts what cannot be left out: the cells of density grids that rays pass, each network forward once where a stream
 //! has a density and backward where that is not faint, the rows of tables that are read and added to there, and moments that
@@ -17,9 +17,8 @@ use std::time::Instant;
 use divff::config::Config;
 use divff::field::Field;
 use divff::field::hashgrid::Row;
-use divff::field::mlp::{Mlp, Precision};
+use divff::field::mlp::Mlp;
 use divff::scene::Scene;
-use divff::simd::matrix;
 use divff::synth::{self, SynthOptions};
 use divff::train::step::StepReport;
 use divff::train::{TrainError, Trainer};
@@ -143,14 +142,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     if let Ok(steps) = std::env::var("DIVFF_STEPS") {
         config.train.steps = steps.parse()?;
     }
+    if let Ok(precision) = std::env::var("DIVFF_PRECISION") {
+        config.train.precision = serde_json::from_value(precision.into())?;
+    }
     let steps = config.train.steps;
     let mut trainer = Trainer::new(&scene, &config)?;
     let threads = rayon::current_num_threads();
     let rows: usize = trainer.trained().field.tables.iter().flatten().map(Vec::len).sum();
-    let bf16 = match config.train.precision {
-        Precision::Auto => matrix::available(),
-        precision => precision == Precision::Bf16,
-    };
+    let bf16 = config.train.precision.is_bf16();
     println!(
         "   at evaluations  networks  rows  moments  cells  floor/ms   time  placing  encoding  evaluating  updating    floor"
     );

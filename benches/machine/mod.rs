@@ -6,6 +6,7 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use divff::field::hashgrid::Row;
+use divff::simd::{Finish, Product, TILE, dots, matrix};
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -22,7 +23,8 @@ const ROWS: [usize; 2] = [1 << 6, 1 << 20];
 pub struct Machine {
     /// Floating-point operations a second in f32, a fused multiply-add being two.
     pub flops: f64,
-    /// The same in bf16 on the matrix units. Not measured: 2600 GFLOP/s a thread, unless `DIVFF_BF16_GFLOPS` says otherwise.
+    /// The same in bf16: on matrix units 2600 GFLOP/s a thread, which is not measured, unless `DIVFF_BF16_GFLOPS` says otherwise; else
+    /// what products in the nearest cache reach.
     pub bf16_flops: f64,
     /// Rows of 16 bytes read a second from tables of [`ROWS`], twice as many, and so on, one table a thread: in pairs of neighbours
     /// at random places.
@@ -39,7 +41,11 @@ impl Machine {
     pub fn measure(threads: usize, state: usize) -> Self {
         let pool =
             rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads can be started");
-        let bf16 = std::env::var("DIVFF_BF16_GFLOPS").ok().and_then(|v| v.parse().ok()).unwrap_or(2600.0);
+        let told = std::env::var("DIVFF_BF16_GFLOPS").ok().and_then(|v| v.parse::<f64>().ok());
+        let bf16_flops = || match (told, matrix::available()) {
+            (None, false) => best(|| together(&mut vec![(); threads], |()| bf16_products())),
+            (told, _) => 1e9 * told.unwrap_or(2600.0) * threads as f64,
+        };
         let flops =
             || best(|| together(&mut vec![(); threads], |()| pulp::Arch::new().dispatch(MultiplyAdds)));
         pool.install(|| {
@@ -48,7 +54,7 @@ impl Machine {
             let read = tables(threads, |table| pulp::Arch::new().dispatch(Reads(table)));
             let added = tables(threads, |table| pulp::Arch::new().dispatch(Adds(table)));
             let bytes = bytes(threads, state);
-            Self { flops: flops().max(before), bf16_flops: 1e9 * bf16 * threads as f64, read, added, bytes }
+            Self { flops: flops().max(before), bf16_flops: bf16_flops(), read, added, bytes }
         })
     }
 
@@ -89,6 +95,21 @@ fn bytes(threads: usize, state: usize) -> f64 {
     let fastest = best(round);
     black_box(&floats);
     fastest
+}
+
+/// Operations of products of pairs of bf16 that stay in the nearest cache.
+fn bf16_products() -> f64 {
+    const INPUTS: usize = 64;
+    const OUTPUTS: usize = 64;
+    const TIMES: usize = 4_000;
+    let (w, x) = (vec![0; OUTPUTS * INPUTS / 2], vec![0; INPUTS / 2 * TILE]);
+    let mut y = vec![0.0; OUTPUTS * TILE];
+    for _ in 0..TIMES {
+        let product = Product { w: &w, bias: &[], x: &x, finish: Finish::Plain, ahead: std::ptr::null() };
+        dots::multiply(black_box(product), &mut y);
+        black_box(&mut y);
+    }
+    (2 * TIMES * OUTPUTS * INPUTS * TILE) as f64
 }
 
 /// Numbers that are read and written back.

@@ -2,7 +2,7 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::mlp::{Activations, Mlp, Precision};
+use super::mlp::{Activations, Arithmetic, Mlp};
 use crate::rng::Rng;
 use crate::simd::matrix::Unit;
 use crate::simd::{AlignedVec, TILE};
@@ -46,16 +46,16 @@ struct Outcome {
     params: Vec<f32>,
 }
 
-struct Pass<'a>(&'a Case, Precision, Unit);
+struct Pass<'a>(&'a Case, Arithmetic, Unit);
 
 impl WithSimd for Pass<'_> {
     type Output = Outcome;
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Outcome {
-        let Self(case, precision, unit) = self;
+        let Self(case, arithmetic, unit) = self;
         let Case { net, params, tiles, grads } = case;
-        let packed = net.pack(params, precision);
+        let packed = net.pack_for(params, arithmetic);
         let (rows, input, output) = (net.rows() * TILE, net.input() * TILE, net.output_row() * TILE);
         let mut a = Activations::default();
         net.reserve(&packed, TILES, &mut a);
@@ -173,7 +173,7 @@ fn close(a: f32, b: f64, what: &str) {
 fn networks_match_f64_loops_forward_and_backward() {
     for (n, shape) in SHAPES.into_iter().cycle().take(SEEDS).enumerate() {
         let case = Case::new(shape, n as u64);
-        let out = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
+        let out = pulp::Arch::new().dispatch(Pass(&case, Arithmetic::Single, Unit::Portable));
         let mut sums = vec![0.0; case.net.parameters()];
         for tile in 0..TILES {
             for lane in 0..TILE {
@@ -200,10 +200,10 @@ fn networks_match_f64_loops_forward_and_backward() {
 fn all_fused_vector_widths_give_the_same_bits_per_sample() {
     for (n, shape) in SHAPES.into_iter().enumerate() {
         let case = Case::new(shape, n as u64);
-        let narrow = pulp::Scalar128b.vectorize(Pass(&case, Precision::F32, Unit::Portable));
+        let narrow = pulp::Scalar128b.vectorize(Pass(&case, Arithmetic::Single, Unit::Portable));
         let wide = [
-            pulp::Scalar256b.vectorize(Pass(&case, Precision::F32, Unit::Portable)),
-            pulp::Scalar512b.vectorize(Pass(&case, Precision::F32, Unit::Portable)),
+            pulp::Scalar256b.vectorize(Pass(&case, Arithmetic::Single, Unit::Portable)),
+            pulp::Scalar512b.vectorize(Pass(&case, Arithmetic::Single, Unit::Portable)),
         ];
         for out in &wide {
             assert_eq!(bits(&out.values), bits(&narrow.values));
@@ -220,8 +220,8 @@ fn all_fused_vector_widths_give_the_same_bits_per_sample() {
 fn the_scalar_fallback_matches_the_hosts_instructions() {
     for (n, shape) in SHAPES.into_iter().enumerate() {
         let case = Case::new(shape, n as u64);
-        let host = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
-        let plain = pulp::Scalar.vectorize(Pass(&case, Precision::F32, Unit::Portable));
+        let host = pulp::Arch::new().dispatch(Pass(&case, Arithmetic::Single, Unit::Portable));
+        let plain = pulp::Scalar.vectorize(Pass(&case, Arithmetic::Single, Unit::Portable));
         for (a, b) in host.values.iter().zip(&plain.values) {
             close(*a, f64::from(*b), "activation");
         }
@@ -232,16 +232,16 @@ fn the_scalar_fallback_matches_the_hosts_instructions() {
 }
 
 /// Chunks of some tiles, gone through one after the other before their parameter gradients are asked for.
-struct Chunks<'a>(&'a Case, Precision, &'a [usize]);
+struct Chunks<'a>(&'a Case, Arithmetic, &'a [usize]);
 
 impl WithSimd for Chunks<'_> {
     type Output = Vec<f32>;
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Vec<f32> {
-        let Self(case, precision, chunks) = self;
+        let Self(case, arithmetic, chunks) = self;
         let Case { net, params, tiles, grads } = case;
-        let (packed, unit) = (net.pack(params, precision), Unit::Portable);
+        let (packed, unit) = (net.pack_for(params, arithmetic), Unit::Portable);
         let (rows, input, output) = (net.rows() * TILE, net.input() * TILE, net.output_row() * TILE);
         let (mut a, mut sums) = (Activations::default(), vec![0.0; net.parameters()]);
         for &count in chunks {
@@ -266,18 +266,18 @@ impl WithSimd for Chunks<'_> {
 fn gradients_of_chunks_add_up() {
     // Below and above a strip, at its end, and what is left over.
     let chunks = [2, 3, 12, 1, 30, 25, 5, 11, 4];
-    for precision in [Precision::F32, Precision::Bf16] {
+    for arithmetic in [Arithmetic::Single, Arithmetic::Rounded, Arithmetic::Matrix] {
         let case = Case::new(SHAPES[2], 7);
-        let together = pulp::Arch::new().dispatch(Chunks(&case, precision, &chunks));
+        let together = pulp::Arch::new().dispatch(Chunks(&case, arithmetic, &chunks));
         let mut alone = vec![0.0f64; case.net.parameters()];
         for tile in chunks.into_iter().flat_map(|count| 0..count) {
             let case = case.tile(tile % TILES);
-            let one = pulp::Arch::new().dispatch(Chunks(&case, precision, &[1]));
+            let one = pulp::Arch::new().dispatch(Chunks(&case, arithmetic, &[1]));
             alone.iter_mut().zip(one).for_each(|(sum, g)| *sum += f64::from(g));
         }
         let size = alone.iter().map(|g| g * g).sum::<f64>().sqrt();
         let error = together.iter().zip(&alone).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum::<f64>().sqrt();
-        assert!(error < 1e-5 * size, "{precision:?}: off by {error} of {size}");
+        assert!(error < 1e-5 * size, "{arithmetic:?}: off by {error} of {size}");
     }
 }
 
@@ -285,50 +285,39 @@ fn bits(v: &[f32]) -> Vec<u32> {
     v.iter().map(|v| v.to_bits()).collect()
 }
 
+/// How far the outcome `b` is from `a`, at most `share` of its size.
+fn assert_within(share: f32, a: &Outcome, b: &Outcome, what: &str) {
+    let parts = [(&a.values, &b.values), (&a.gradients, &b.gradients), (&a.params, &b.params)];
+    for (part, (a, b)) in parts.into_iter().enumerate() {
+        let size = a.iter().map(|a| a * a).sum::<f32>().sqrt();
+        let error = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt();
+        assert!(error < share * size, "{what}, part {part}: off by {error} of {size}");
+    }
+}
+
 /// bf16 rounds every factor by up to 2⁻⁹, and flips some ReLUs: some per cent after four layers, in the mean.
 #[test]
 fn bf16_products_match_f32_ones() {
     for (n, shape) in SHAPES.into_iter().enumerate() {
         let case = Case::new(shape, n as u64);
-        let exact = pulp::Arch::new().dispatch(Pass(&case, Precision::F32, Unit::Portable));
-        let rounded = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::detect()));
-        for (a, b) in [
-            (&exact.values, &rounded.values),
-            (&exact.gradients, &rounded.gradients),
-            (&exact.params, &rounded.params),
-        ] {
-            let size: f32 = a.iter().map(|a| a * a).sum();
-            let error: f32 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
-            assert!(
-                error.sqrt() < 0.1 * size.sqrt(),
-                "{shape:?}: off by {} of {}",
-                error.sqrt(),
-                size.sqrt()
-            );
+        let exact = pulp::Arch::new().dispatch(Pass(&case, Arithmetic::Single, Unit::Portable));
+        for arithmetic in [Arithmetic::Rounded, Arithmetic::Matrix] {
+            let rounded = pulp::Arch::new().dispatch(Pass(&case, arithmetic, Unit::detect()));
+            assert_within(0.1, &exact, &rounded, &format!("{shape:?}, {arithmetic:?}"));
         }
     }
 }
 
-/// The matrix units and plain loops sum in another order; what that changes is rounded away, or to the next bf16.
+/// The matrix units, dot products of pairs and plain loops sum in another order each; what that changes is rounded away, or to the next
+/// bf16.
 #[test]
-fn the_matrix_units_match_plain_loops() {
+fn bf16_instructions_match_plain_loops() {
     for (n, shape) in SHAPES.into_iter().enumerate() {
         let case = Case::new(shape, n as u64);
-        let units = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::detect()));
-        let plain = pulp::Arch::new().dispatch(Pass(&case, Precision::Bf16, Unit::Portable));
-        for (a, b) in [
-            (&units.values, &plain.values),
-            (&units.gradients, &plain.gradients),
-            (&units.params, &plain.params),
-        ] {
-            let size: f32 = a.iter().map(|a| a * a).sum();
-            let error: f32 = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
-            assert!(
-                error.sqrt() < 1e-3 * size.sqrt(),
-                "{shape:?}: off by {} of {}",
-                error.sqrt(),
-                size.sqrt()
-            );
+        let plain = pulp::Arch::new().dispatch(Pass(&case, Arithmetic::Matrix, Unit::Portable));
+        for arithmetic in [Arithmetic::Rounded, Arithmetic::Matrix] {
+            let units = pulp::Arch::new().dispatch(Pass(&case, arithmetic, Unit::detect()));
+            assert_within(1e-3, &plain, &units, &format!("{shape:?}, {arithmetic:?}"));
         }
     }
 }

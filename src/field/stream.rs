@@ -402,7 +402,7 @@ pub struct StreamRanges {
 mod tests {
     use super::*;
     use crate::field::batch::tests::encoded;
-    use crate::field::mlp::Precision;
+    use crate::field::mlp::Arithmetic;
     use crate::field::{EncodingKind, Field, Stream};
     use crate::rng::Rng;
     use crate::train::testing;
@@ -410,7 +410,7 @@ mod tests {
     /// What a stream says of the samples `keep` of a batch, first asked for the density of all of them if their tiles are known.
     struct Said<'a> {
         field: &'a Field,
-        precision: Precision,
+        arithmetic: Arithmetic,
         keep: fn(usize) -> bool,
         tiles: Tiles,
     }
@@ -420,12 +420,12 @@ mod tests {
 
         #[inline(always)]
         fn with_simd<S: Simd>(self, simd: S) -> StreamSamples {
-            let Self { field, precision, keep, tiles } = self;
+            let Self { field, arithmetic, keep, tiles } = self;
             let first = tiles == Tiles::Known;
             let (net, r) =
                 (field.net(Stream::Dynamic).expect("all streams are on"), &field.layout.streams[1]);
             let [trunk, head] = [(&net.trunk, &r.trunk), (&net.head, &r.head)]
-                .map(|(net, range)| net.pack(&field.weights[range.clone()], precision));
+                .map(|(net, range)| net.pack_for(&field.weights[range.clone()], arithmetic));
             let w = StreamWeights { tables: &field.tables[1], trunk: &trunk, head: &head };
             let (mut activations, mut out) = (StreamActivations::default(), StreamSamples::default());
             out.reset(COUNT);
@@ -450,10 +450,10 @@ mod tests {
         let mut rng = Rng::new(4, 0, 0);
         field.weights.iter_mut().for_each(|w| *w = rng.uniform() - 0.5);
         let keeps: [fn(usize) -> bool; 4] = [|_| false, |n| n % 90 == 7, |n| n % 3 > 0, |_| true];
-        for precision in [Precision::F32, Precision::Bf16] {
+        for arithmetic in [Arithmetic::Single, Arithmetic::Rounded, Arithmetic::Matrix] {
             for keep in keeps {
                 let said = |tiles| {
-                    let out = pulp::Arch::new().dispatch(Said { field: &field, precision, keep, tiles });
+                    let out = pulp::Arch::new().dispatch(Said { field: &field, arithmetic, keep, tiles });
                     let StreamSamples { sigma, rgb: [r, g, b], beta } = out;
                     [sigma, r, g, b, beta].map(|column| column.to_vec())
                 };

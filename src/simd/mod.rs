@@ -4,6 +4,7 @@
 //! they need no `unsafe`. Lanes are always samples, never features: every width gives the same forward result
 //! for every sample.
 
+pub mod dots;
 pub mod floats;
 pub mod lanes;
 mod machine;

@@ -1,21 +1,23 @@
 //! Small fully connected networks on tiles of samples, forward and backward.
 //!
 //! A tile's inputs, outputs and their gradients are f32, feature-major `[features][TILE]`. What lies between is the
-//! business of the arithmetic: `vector` computes in f32, `matrix` multiplies in bf16 and sums in f32. Both keep a
-//! chunk's activations together, so that the weight gradients are products over many of its samples.
+//! business of the arithmetic: `vector` computes in f32, of which factors may be rounded to bf16; `matrix` keeps and multiplies bf16, as
+//! matrix units do, and sums in f32. Both keep a chunk's activations together, so that the weight gradients are products over many of its
+//! samples.
 
 mod gradient;
 mod matrix;
 mod vector;
 
+use bytemuck::cast_slice_mut;
 use pulp::Simd;
 use serde::{Deserialize, Serialize};
 
 use self::gradient::{Strip, Sums, TileView};
 use crate::simd::floats::{ColumnMut, Floats};
 use crate::simd::lanes::{self, Layout};
-use crate::simd::matrix::{Unit, available};
-use crate::simd::{AlignedVec, TILE};
+use crate::simd::matrix::{Unit, available as matrix_units};
+use crate::simd::{AlignedVec, TILE, dots};
 
 /// Widths are multiples of this.
 const BLOCK: usize = 4;
@@ -37,19 +39,40 @@ fn is_like_avx2<S: Simd>() -> bool {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// bf16 on CPUs with matrix units (Intel AMX), else f32.
+    /// bf16 on CPUs with instructions for it (Intel AMX, AVX512-BF16), else f32.
     #[default]
     Auto,
     /// f32.
     F32,
-    /// bf16; slow on CPUs without matrix units.
+    /// bf16; slow on CPUs without such instructions.
     Bf16,
 }
 
 impl Precision {
-    fn is_bf16(self) -> bool {
-        self == Self::Bf16 || self == Self::Auto && available()
+    /// Whether this CPU multiplies in bf16.
+    pub fn is_bf16(self) -> bool {
+        self == Self::Bf16 || self == Self::Auto && (matrix_units() || dots::available())
     }
+
+    /// What that is done with on this CPU.
+    fn arithmetic(self) -> Arithmetic {
+        match self.is_bf16() {
+            false => Arithmetic::Single,
+            true if matrix_units() => Arithmetic::Matrix,
+            true => Arithmetic::Rounded,
+        }
+    }
+}
+
+/// How networks are multiplied.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Arithmetic {
+    /// In f32.
+    Single,
+    /// In f32 tiles, of which factors are rounded to bf16.
+    Rounded,
+    /// In bf16 tiles, as matrix units do.
+    Matrix,
 }
 
 /// The shape of a network with ReLU between its layers and none after the last.
@@ -140,15 +163,27 @@ impl Mlp {
 
     /// The weights as the kernels read them; made once per step.
     pub fn pack(&self, params: &[f32], precision: Precision) -> Packed {
-        match precision.is_bf16() {
-            true => Packed::Matrix(matrix::Packed::new(&self.layers, params)),
-            false => Packed::Vector(vector::Packed::new(&self.layers, params)),
+        self.pack_for(params, precision.arithmetic())
+    }
+
+    /// As [`Self::pack`], for an arithmetic that this CPU need not have instructions for.
+    pub(crate) fn pack_for(&self, params: &[f32], arithmetic: Arithmetic) -> Packed {
+        let vector = |rounded| Packed::Vector(vector::Packed::new(&self.layers, params, rounded));
+        match arithmetic {
+            Arithmetic::Single => vector(false),
+            Arithmetic::Rounded => vector(true),
+            Arithmetic::Matrix => Packed::Matrix(matrix::Packed::new(&self.layers, params)),
         }
     }
 
     /// Makes room for the activations of `tiles` tiles.
     pub fn reserve(&self, packed: &Packed, tiles: usize, a: &mut Activations) {
         (a.input, a.output) = (self.input() * TILE, self.output() * TILE);
+        a.rounded = packed.is_rounded();
+        if a.rounded {
+            let widest = self.layers.iter().map(|l| l.n_in.max(l.n_out)).max().unwrap_or(0);
+            a.pairs.reserve_len(widest / 2 * TILE);
+        }
         let floats = match packed {
             Packed::Vector(_) => {
                 a.stride = self.rows() * TILE;
@@ -170,7 +205,7 @@ impl Mlp {
         a.tiles = tiles;
         // As many in every strip, since the sums at the end of one take time.
         let all = a.waiting + tiles;
-        let strip = gradient::strip::<S>();
+        let strip = gradient::strip::<S>(a.rounded);
         a.strip = if all < strip { strip } else { all.div_ceil(all.div_ceil(strip)) };
         let kept = a.strip.min(all).max(a.waiting + 1);
         a.grads.reserve_len((kept * a.stride).max(a.end));
@@ -195,10 +230,10 @@ impl Mlp {
     ) {
         let at = a.first + n;
         let ahead = a.to_next(at);
-        let tile = &mut a.values[at * a.stride..][..a.end];
+        let (tile, pairs) = (&mut a.values[at * a.stride..][..a.end], cast_slice_mut(&mut a.pairs));
         match packed {
             Packed::Vector(packed) => {
-                packed.forward(simd, &self.layers, tile, outputs.next_multiple_of(BLOCK), ahead);
+                packed.forward(simd, &self.layers, tile, outputs.next_multiple_of(BLOCK), ahead, pairs);
             }
             Packed::Matrix(packed) => packed.forward(unit, &self.layers, tile, &mut a.saved, n),
         }
@@ -229,7 +264,8 @@ impl Mlp {
         }
         match packed {
             Packed::Vector(packed) => {
-                packed.backward(simd, &self.layers, &a.values[at * a.stride..][..a.end], grad, ahead);
+                let (tile, pairs) = (&a.values[at * a.stride..][..a.end], cast_slice_mut(&mut a.pairs));
+                packed.backward(simd, &self.layers, tile, grad, ahead, pairs);
                 a.waiting += 1;
                 // Those of a chunk that begins a strip may wait for the next chunk; others are not where it will be.
                 if a.waiting >= a.strip || last && a.waiting <= n {
@@ -252,7 +288,7 @@ impl Mlp {
         let view = |data| TileView { data, stride: a.stride, offset: 0 };
         let (values, grads) = (view(&a.values[first * a.stride..]), view(&a.grads));
         let count = std::mem::take(&mut a.waiting);
-        a.sums.add(simd, &self.layers, Strip { values, grads, count });
+        a.sums.add(simd, &self.layers, Strip { values, grads, count }, a.rounded);
     }
 
     /// Adds the parameter gradients of all tiles that have gone [`Self::backward`] to `out`, in the order of the parameters.
@@ -298,13 +334,18 @@ impl Layer {
 
 /// Weights in the orders that the kernels stream through.
 pub enum Packed {
-    /// For [`Precision::F32`].
+    /// For [`Arithmetic::Single`] and [`Arithmetic::Rounded`].
     Vector(vector::Packed),
-    /// For [`Precision::Bf16`].
+    /// For [`Arithmetic::Matrix`].
     Matrix(matrix::Packed),
 }
 
 impl Packed {
+    /// Whether they are for [`Arithmetic::Rounded`].
+    fn is_rounded(&self) -> bool {
+        matches!(self, Self::Vector(packed) if packed.is_rounded())
+    }
+
     /// Whether every tile's inputs and outputs stay after others have been evaluated.
     pub fn keeps_tiles(&self) -> bool {
         matches!(self, Self::Vector(_))
@@ -334,6 +375,9 @@ pub struct Activations {
     input: usize,
     output: usize,
     saved: matrix::Saved,
+    /// Whether factors are rounded to bf16, and what is rounded for a product.
+    rounded: bool,
+    pairs: AlignedVec,
 }
 
 impl Activations {

@@ -4,6 +4,8 @@
 #[cfg(target_arch = "x86_64")]
 pub mod amx;
 #[cfg(target_arch = "x86_64")]
+pub mod dots;
+#[cfg(target_arch = "x86_64")]
 mod lanes;
 #[cfg(target_arch = "x86_64")]
 mod products;
@@ -87,13 +89,13 @@ pub enum Finish<'a> {
 
 /// y = W x + b for one tile, finished.
 #[derive(Clone, Copy)]
-pub struct Product<'a> {
+pub struct Product<'a, T = f32> {
     /// W `[block][input][4]`, four outputs a block.
-    pub w: &'a [f32],
+    pub w: &'a [T],
     /// b `[output]`, or nothing.
     pub bias: &'a [f32],
     /// x `[input][TILE]`.
-    pub x: &'a [f32],
+    pub x: &'a [T],
     /// What becomes of y.
     pub finish: Finish<'a>,
     /// As many rows as y has are asked for from here on meanwhile, since they are needed later; they may be anywhere.

@@ -8,7 +8,7 @@ use super::{Strip, TileView, inputs_together};
 use crate::simd::{TILE, add_quarter_sums};
 
 /// Four numbers each of four parameters' gradient, which are yet to be summed: number `n` of all sixteen is of parameter `n % 4`.
-type Partial = [f32; BLOCK * BLOCK];
+pub type Partial = [f32; BLOCK * BLOCK];
 
 /// Numbers that are summed.
 pub fn len(layers: &[Layer]) -> usize {
@@ -21,11 +21,10 @@ pub fn len(layers: &[Layer]) -> usize {
 #[inline(always)]
 pub fn accumulate<S: Simd>(simd: S, layers: &[Layer], strip: Strip, sums: &mut [f32]) {
     let count = strip.count;
-    let (sums, _) = sums.as_chunks_mut();
     for layer in layers {
-        let (weights, biases) = sums[layer.param / BLOCK..].split_at_mut(layer.weights() / BLOCK);
+        let (weights, biases) = parts(sums, layer);
         let [x, dy] = strip.of(layer);
-        for (block, bias) in biases[..layer.n_out / BLOCK].iter_mut().enumerate() {
+        for (block, bias) in biases.iter_mut().enumerate() {
             bias_gradient(simd, dy.rows(block * BLOCK), count, bias);
         }
         // The inputs, of which there are more at a time than outputs, stay in the nearest cache while all outputs pass.
@@ -44,6 +43,14 @@ pub fn accumulate<S: Simd>(simd: S, layers: &[Layer], strip: Strip, sums: &mut [
             i += wide;
         }
     }
+}
+
+/// Those of all sums that are of a layer's weights, and of its biases.
+#[inline(always)]
+pub fn parts<'a>(sums: &'a mut [f32], layer: &Layer) -> (&'a mut [Partial], &'a mut [Partial]) {
+    let (weights, biases) =
+        sums.as_chunks_mut().0[layer.param / BLOCK..].split_at_mut(layer.weights() / BLOCK);
+    (weights, &mut biases[..layer.n_out / BLOCK])
 }
 
 /// Adds `sums` to `out`, in the order of the parameters.
@@ -127,7 +134,7 @@ fn outputs_by_inputs<S: Simd, const OUTPUTS: usize, const INPUTS: usize>(
 
 /// Adds Σ over samples of dy[j] to `out`.
 #[inline(always)]
-fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Partial) {
+pub fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Partial) {
     let vectors = TILE / S::F32_LANES;
     // Sums of their own for every third vector, so that none waits for the one before it.
     let mut acc = [[simd.splat_f32s(0.0); BLOCK]; 3];

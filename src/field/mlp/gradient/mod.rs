@@ -1,9 +1,11 @@
-//! Gradients of weights in f32: sums over samples of an output's gradient times an input.
+//! Gradients of weights: sums over samples of an output's gradient times an input.
 //!
 //! Vectors of samples are what tiles hold, but then a sum over lanes is left for every weight ([`by_samples`]); where registers are
-//! few, it weighs too much, and vectors of outputs are made first ([`by_outputs`]).
+//! few, it weighs too much, and vectors of outputs are made first ([`by_outputs`]). With factors that are rounded to bf16 it weighs least,
+//! since a vector holds twice as many samples ([`by_pairs`]).
 
 mod by_outputs;
+mod by_pairs;
 mod by_samples;
 
 use pulp::Simd;
@@ -14,8 +16,10 @@ use crate::simd::{AlignedVec, TILE};
 /// Most tiles whose gradients are kept until those of the weights are summed: with what was evaluated there, they stay near
 /// the core, and a sum over fewer would not be worth its end.
 #[inline(always)]
-pub fn strip<S: Simd>() -> usize {
-    if is_like_avx2::<S>() {
+pub fn strip<S: Simd>(rounded: bool) -> usize {
+    if rounded {
+        18
+    } else if is_like_avx2::<S>() {
         // Sums have no end, so that the nearest cache may decide.
         2
     } else if S::REGISTER_COUNT < 32 {
@@ -32,7 +36,9 @@ pub fn strip<S: Simd>() -> usize {
 pub struct Sums {
     values: AlignedVec,
     any: bool,
-    /// What vectors of outputs are made in.
+    /// Whether they are of factors that are rounded to bf16.
+    rounded: bool,
+    /// What vectors of outputs, or of rounded numbers, are made in.
     panel: AlignedVec,
 }
 
@@ -50,23 +56,27 @@ impl Sums {
         &mut self.values[..len]
     }
 
-    /// Adds the gradients of a strip.
+    /// Adds the gradients of a strip, of factors that are `rounded` to bf16 or not: always one or the other.
     #[inline(always)]
-    pub fn add<S: Simd>(&mut self, simd: S, layers: &[Layer], strip: Strip) {
-        if is_like_avx2::<S>() {
-            let mut panel = std::mem::take(&mut self.panel);
+    pub fn add<S: Simd>(&mut self, simd: S, layers: &[Layer], strip: Strip, rounded: bool) {
+        self.rounded = rounded;
+        let mut panel = std::mem::take(&mut self.panel);
+        if rounded {
+            by_pairs::accumulate(simd, layers, strip, self.of(by_samples::len(layers)), &mut panel);
+        } else if is_like_avx2::<S>() {
             by_outputs::accumulate(simd, layers, strip, self.of(by_outputs::len(layers)), &mut panel);
-            self.panel = panel;
         } else {
             by_samples::accumulate(simd, layers, strip, self.of(by_samples::len(layers)));
         }
+        self.panel = panel;
     }
 
     /// Adds what [`Self::add`] has summed to `out`, in the order of the parameters, and forgets it.
     #[inline(always)]
     pub fn unpack<S: Simd>(&mut self, layers: &[Layer], out: &mut [f32]) {
         if std::mem::take(&mut self.any) {
-            let unpack = if is_like_avx2::<S>() { by_outputs::unpack } else { by_samples::unpack };
+            let by_outputs = is_like_avx2::<S>() && !self.rounded;
+            let unpack = if by_outputs { by_outputs::unpack } else { by_samples::unpack };
             unpack(layers, &self.values, out);
         }
     }
