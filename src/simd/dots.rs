@@ -60,13 +60,14 @@ fn pair_rows_one_by_one(rows: &[f32], out: &mut [Pairs]) {
     }
 }
 
-/// Rounds the rows of tile number `tile` of some to pairs of neighbouring samples; row after row of `stride` pairs, of which those behind
-/// this tile in the last vector become zeros.
+/// Rounds the rows of tile number `tile` of `tiles` to pairs of neighbouring samples: row after row of [`pairs_of`] them, the last vector
+/// of which ends with zeros.
 #[inline(always)]
-pub fn pair_samples(rows: &[f32], tile: usize, stride: usize, out: &mut [Pairs]) {
-    let (first, end) = (tile * TILE / 2, ((tile + 1) * TILE / 2));
-    if !end.is_multiple_of(LANES) {
-        out.chunks_exact_mut(stride).for_each(|row| row[end..end.next_multiple_of(LANES)].fill(0));
+pub fn pair_samples(rows: &[f32], [tile, tiles]: [usize; 2], out: &mut [Pairs]) {
+    let stride = pairs_of(tiles);
+    let (first, end) = (tile * TILE / 2, (tile + 1) * TILE / 2);
+    if tile + 1 == tiles && end < stride {
+        out.chunks_exact_mut(stride).for_each(|row| row[end..].fill(0));
     }
     #[cfg(target_arch = "x86_64")]
     if let Some(dots) = Dots::new() {
@@ -210,7 +211,7 @@ mod tests {
             let stride = pairs_of(tiles);
             let mut out = vec![7; 3 * stride];
             for (n, tile) in values.iter().enumerate() {
-                pair_samples(tile, n, stride, &mut out);
+                pair_samples(tile, [n, tiles], &mut out);
             }
             for (row, out) in out.chunks_exact(stride).enumerate() {
                 let samples: Vec<f32> =

@@ -145,7 +145,7 @@ unsafe fn multiply_blocks<const BLOCKS: usize>(product: &Product<Pairs>, block: 
     }
     for n in 0..BLOCKS * BLOCK {
         for v in 0..VECTORS {
-            _mm_prefetch::<_MM_HINT_T0>(y.wrapping_add((first + n) * TILE + v * LANES).cast());
+            _mm_prefetch::<_MM_HINT_T0>(product.ahead.wrapping_add((first + n) * TILE + v * LANES).cast());
         }
     }
     for _ in 0..pairs {

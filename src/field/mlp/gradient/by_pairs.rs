@@ -32,8 +32,8 @@ pub fn accumulate<S: Simd>(
         let (x_pairs, dy_pairs) =
             rounded[..(layer.n_in + layer.n_out) * stride].split_at_mut(layer.n_in * stride);
         for tile in 0..strip.count {
-            pair_samples(x.of(tile, layer.n_in), tile, stride, x_pairs);
-            pair_samples(dy.of(tile, layer.n_out), tile, stride, dy_pairs);
+            pair_samples(x.of(tile, layer.n_in), [tile, strip.count], x_pairs);
+            pair_samples(dy.of(tile, layer.n_out), [tile, strip.count], dy_pairs);
         }
         // The inputs, of which there are more at a time than outputs, stay in the nearest cache while all outputs pass.
         let mut i = 0;
