@@ -60,10 +60,10 @@ fn pair_rows_one_by_one(rows: &[f32], out: &mut [Pairs]) {
     }
 }
 
-/// Rounds the rows of tile number `tile` of `tiles` to pairs of neighbouring samples: row after row of [`pairs_of`] them, the last vector
-/// of which ends with zeros.
+/// From pairs of neighbouring rows `[n][TILE]`, of tile number `tile` of `tiles`, to pairs of neighbouring samples: row after row of
+/// [`pairs_of`] them, the last vector of which ends with zeros.
 #[inline(always)]
-pub fn pair_samples(rows: &[f32], [tile, tiles]: [usize; 2], out: &mut [Pairs]) {
+pub fn pair_samples(rows: &[Pairs], [tile, tiles]: [usize; 2], out: &mut [Pairs]) {
     let stride = pairs_of(tiles);
     let (first, end) = (tile * TILE / 2, (tile + 1) * TILE / 2);
     if tile + 1 == tiles && end < stride {
@@ -77,10 +77,11 @@ pub fn pair_samples(rows: &[f32], [tile, tiles]: [usize; 2], out: &mut [Pairs]) 
 }
 
 #[inline(always)]
-fn pair_samples_one_by_one(rows: &[f32], stride: usize, out: &mut [Pairs]) {
-    for (rows, out) in rows.as_chunks::<TILE>().0.iter().zip(out.chunks_mut(stride)) {
-        for (out, [low, high]) in out.iter_mut().zip(rows.as_chunks().0) {
-            *out = pair(*low, *high);
+fn pair_samples_one_by_one(rows: &[Pairs], stride: usize, out: &mut [Pairs]) {
+    for (rows, out) in rows.as_chunks::<TILE>().0.iter().zip(out.chunks_mut(2 * stride)) {
+        for (n, [even, odd]) in rows.as_chunks().0.iter().enumerate() {
+            out[n] = even & 0xffff | odd << 16;
+            out[stride + n] = even >> 16 | odd & 0xffff_0000;
         }
     }
 }
@@ -95,26 +96,55 @@ pub fn multiply(product: Product<Pairs>, y: &mut [f32]) {
     multiply_one_by_one(product, y);
 }
 
+/// As [`multiply`], with y rounded to pairs of rows `[output / 2][TILE]`.
 #[inline(always)]
-fn multiply_one_by_one(Product { w, bias, x, finish, .. }: Product<Pairs>, y: &mut [f32]) {
-    let x = x.as_chunks::<TILE>().0;
+pub fn multiply_to_pairs(product: Product<Pairs>, y: &mut [Pairs]) {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(dots) = Dots::new() {
+        return dots.multiply_to_pairs(product, y);
+    }
+    multiply_to_pairs_one_by_one(product, y);
+}
+
+#[inline(always)]
+fn multiply_one_by_one(product: Product<Pairs>, y: &mut [f32]) {
     for (output, y) in y.as_chunks_mut::<TILE>().0.iter_mut().enumerate() {
-        let w = w[output / BLOCK * BLOCK * x.len()..].iter().skip(output % BLOCK).step_by(BLOCK);
-        let mut sums = [bias.get(output).copied().unwrap_or_default(); TILE];
-        for (w, x) in w.zip(x) {
+        *y = output_row(&product, output);
+    }
+}
+
+#[inline(always)]
+fn multiply_to_pairs_one_by_one(product: Product<Pairs>, y: &mut [Pairs]) {
+    for (n, y) in y.as_chunks_mut::<TILE>().0.iter_mut().enumerate() {
+        let [low, high] = [output_row(&product, 2 * n), output_row(&product, 2 * n + 1)];
+        for n in 0..TILE {
+            y[n] = pair(low[n], high[n]);
+        }
+    }
+}
+
+/// One row of a product, finished.
+#[inline(always)]
+fn output_row(Product { w, bias, x, finish, .. }: &Product<Pairs>, output: usize) -> [f32; TILE] {
+    let x = x.as_chunks::<TILE>().0;
+    let w = w[output / BLOCK * BLOCK * x.len()..].iter().skip(output % BLOCK).step_by(BLOCK);
+    let mut sums = [bias.get(output).copied().unwrap_or_default(); TILE];
+    for (w, x) in w.zip(x) {
+        for n in 0..TILE {
+            sums[n] += dot(*w, x[n]);
+        }
+    }
+    match finish {
+        Finish::Plain => {}
+        Finish::Relu => sums.iter_mut().for_each(|sum| *sum = if *sum < 0.0 { 0.0 } else { *sum }),
+        Finish::Where(rows) => {
+            let row = &rows[output / 2 * TILE..][..TILE];
             for n in 0..TILE {
-                sums[n] += dot(*w, x[n]);
+                sums[n] = if row[n] >> (output % 2 * 16) & 0x7fff == 0 { 0.0 } else { sums[n] };
             }
         }
-        *y = match finish {
-            Finish::Plain => sums,
-            Finish::Relu => sums.map(|sum| if sum < 0.0 { 0.0 } else { sum }),
-            Finish::Where(rows) => {
-                let row = &rows[output * TILE..][..TILE];
-                std::array::from_fn(|n| if row[n] > 0.0 { sums[n] } else { 0.0 })
-            }
-        };
     }
+    sums
 }
 
 /// Σ over samples of dy[j] x[k], of four rows dy and `INPUTS` rows x of pairs of samples, `stride` pairs each, but for the sum of
@@ -207,17 +237,24 @@ mod tests {
     fn samples_of_tiles_follow_one_another_and_zeros_the_last() {
         let mut rng = Rng::new(2, 0, 0);
         for tiles in 1..4 {
-            let values: Vec<Vec<f32>> = (0..tiles).map(|_| numbers(&mut rng, 3 * TILE)).collect();
+            let values: Vec<Vec<Pairs>> = (0..tiles).map(|_| pairs(&mut rng, 3 * TILE)).collect();
             let stride = pairs_of(tiles);
-            let mut out = vec![7; 3 * stride];
+            let [mut out, mut slow] = [(); 2].map(|()| vec![7; 6 * stride]);
             for (n, tile) in values.iter().enumerate() {
                 pair_samples(tile, [n, tiles], &mut out);
+                pair_samples_one_by_one(tile, stride, &mut slow[n * TILE / 2..]);
             }
-            for (row, out) in out.chunks_exact(stride).enumerate() {
-                let samples: Vec<f32> =
-                    values.iter().flat_map(|tile| tile[row * TILE..][..TILE].iter().copied()).collect();
-                let truth = samples.as_chunks().0.iter().map(|[low, high]| pair(*low, *high));
-                assert!(truth.chain(std::iter::repeat(0)).zip(out).all(|(truth, out)| truth == *out));
+            for (row, (out, slow)) in out.chunks_exact(stride).zip(slow.chunks_exact(stride)).enumerate() {
+                let half = |pair: Pairs| pair >> (row % 2 * 16) & 0xffff;
+                let samples: Vec<u32> = values
+                    .iter()
+                    .flat_map(|tile| tile[row / 2 * TILE..][..TILE].iter().map(|pair| half(*pair)))
+                    .collect();
+                let truth: Vec<Pairs> =
+                    samples.as_chunks().0.iter().map(|[low, high]| low | high << 16).collect();
+                assert_eq!(out[..truth.len()], truth);
+                assert_eq!(slow[..truth.len()], truth);
+                assert!(out[truth.len()..].iter().all(|pair| *pair == 0));
             }
         }
     }
@@ -227,7 +264,10 @@ mod tests {
         for (inputs, blocks) in [(4, 1), (8, 2), (12, 3), (64, 5)] {
             let mut rng = Rng::new(inputs as u64, 0, 0);
             let (w, x) = (pairs(&mut rng, inputs / 2 * BLOCK * blocks), pairs(&mut rng, inputs / 2 * TILE));
-            let [bias, rows] = [BLOCK * blocks, BLOCK * blocks * TILE].map(|n| numbers(&mut rng, n));
+            let mut rows = pairs(&mut rng, BLOCK * blocks / 2 * TILE);
+            // Either, neither and one of them below 0, which counts as well.
+            (0..8).for_each(|n| rows[n] &= [0, 0x8000_8000, 0xffff, 0xffff_0000][n % 4]);
+            let bias = numbers(&mut rng, BLOCK * blocks);
             for finish in [Finish::Plain, Finish::Relu, Finish::Where(&rows)] {
                 for bias in [&bias[..], &[]] {
                     let product = Product { w: &w, bias, x: &x, finish, ahead: std::ptr::null() };
@@ -235,6 +275,14 @@ mod tests {
                     multiply(product, &mut fast);
                     multiply_one_by_one(product, &mut slow);
                     assert_close(&fast, &slow, inputs);
+                    let mut paired = vec![7; fast.len() / 2];
+                    multiply_to_pairs(product, &mut paired);
+                    let mut truth = paired.clone();
+                    pair_rows(&fast, &mut truth);
+                    assert_eq!(paired, truth, "rounding comes last");
+                    multiply_to_pairs_one_by_one(product, &mut paired);
+                    pair_rows(&slow, &mut truth);
+                    assert_eq!(paired, truth);
                 }
             }
         }

@@ -1,15 +1,16 @@
 //! Small fully connected networks on tiles of samples, forward and backward.
 //!
 //! A tile's inputs, outputs and their gradients are f32, feature-major `[features][TILE]`. What lies between is the
-//! business of the arithmetic: `vector` computes in f32, of which factors may be rounded to bf16; `matrix` keeps and multiplies bf16, as
-//! matrix units do, and sums in f32. Both keep a chunk's activations together, so that the weight gradients are products over many of its
+//! business of the arithmetic: `vector` computes in f32; `rounded` and `matrix` multiply in bf16 and sum in f32, one for dot products of
+//! pairs, the other for matrix units. All keep a chunk's activations together, so that the weight gradients are products over many of its
 //! samples.
 
 mod gradient;
 mod matrix;
+mod rounded;
 mod vector;
 
-use bytemuck::cast_slice_mut;
+use bytemuck::{cast_slice, cast_slice_mut};
 use pulp::Simd;
 use serde::{Deserialize, Serialize};
 
@@ -69,9 +70,9 @@ impl Precision {
 pub(crate) enum Arithmetic {
     /// In f32.
     Single,
-    /// In f32 tiles, of which factors are rounded to bf16.
+    /// In bf16, by dot products of pairs.
     Rounded,
-    /// In bf16 tiles, as matrix units do.
+    /// In bf16, by matrix units.
     Matrix,
 }
 
@@ -168,10 +169,9 @@ impl Mlp {
 
     /// As [`Self::pack`], for an arithmetic that this CPU need not have instructions for.
     pub(crate) fn pack_for(&self, params: &[f32], arithmetic: Arithmetic) -> Packed {
-        let vector = |rounded| Packed::Vector(vector::Packed::new(&self.layers, params, rounded));
         match arithmetic {
-            Arithmetic::Single => vector(false),
-            Arithmetic::Rounded => vector(true),
+            Arithmetic::Single => Packed::Vector(vector::Packed::new(&self.layers, params)),
+            Arithmetic::Rounded => Packed::Rounded(rounded::Packed::new(&self.layers, params)),
             Arithmetic::Matrix => Packed::Matrix(matrix::Packed::new(&self.layers, params)),
         }
     }
@@ -179,14 +179,16 @@ impl Mlp {
     /// Makes room for the activations of `tiles` tiles.
     pub fn reserve(&self, packed: &Packed, tiles: usize, a: &mut Activations) {
         (a.input, a.output) = (self.input() * TILE, self.output() * TILE);
-        a.rounded = packed.is_rounded();
-        if a.rounded {
-            let widest = self.layers.iter().map(|l| l.n_in.max(l.n_out)).max().unwrap_or(0);
-            a.pairs.reserve_len(widest / 2 * TILE);
-        }
+        a.rounded = matches!(packed, Packed::Rounded(_));
         let floats = match packed {
             Packed::Vector(_) => {
                 a.stride = self.rows() * TILE;
+                a.stride * (a.waiting + tiles)
+            }
+            Packed::Rounded(_) => {
+                a.stride = (self.output_row() / 2 + self.output()) * TILE;
+                a.rows.reserve_len(a.input);
+                a.row_grads.reserve_len(2 * a.input + a.output);
                 a.stride * (a.waiting + tiles)
             }
             Packed::Matrix(packed) => {
@@ -230,10 +232,13 @@ impl Mlp {
     ) {
         let at = a.first + n;
         let ahead = a.to_next(at);
-        let (tile, pairs) = (&mut a.values[at * a.stride..][..a.end], cast_slice_mut(&mut a.pairs));
+        let (tile, outputs) = (&mut a.values[at * a.stride..][..a.end], outputs.next_multiple_of(BLOCK));
         match packed {
-            Packed::Vector(packed) => {
-                packed.forward(simd, &self.layers, tile, outputs.next_multiple_of(BLOCK), ahead, pairs);
+            Packed::Vector(packed) => packed.forward(simd, &self.layers, tile, outputs, ahead),
+            Packed::Rounded(packed) => {
+                let (tile, output) = tile.split_at_mut(a.end - a.output);
+                let output = &mut output[..outputs * TILE];
+                packed.forward(&self.layers, &a.rows[..a.input], cast_slice_mut(tile), output, ahead);
             }
             Packed::Matrix(packed) => packed.forward(unit, &self.layers, tile, &mut a.saved, n),
         }
@@ -243,7 +248,7 @@ impl Mlp {
     /// [`Packed::keeps_tiles`].
     pub fn retain(&self, a: &mut Activations, kept: &[u32]) {
         let values = &mut a.values[a.first * a.stride..];
-        lanes::keep(values, Layout { rows: self.rows(), stride: a.stride }, kept);
+        lanes::keep(values, Layout { rows: a.stride / TILE, stride: a.stride }, kept);
     }
 
     /// From the gradient of the output rows of tile `n` to that of its input rows, tile after tile; the parameters' gradients
@@ -254,23 +259,22 @@ impl Mlp {
         a.latest = a.waiting;
         let at = a.first + n;
         let ahead = a.to_next(at);
-        let grad = &mut a.grads[a.waiting * a.stride..][..a.end];
-        let mut output = ColumnMut::new(simd, &mut grad[a.end - a.output..]);
+        let floats = a.output;
+        let mut output = ColumnMut::new(simd, a.output_grad());
         let [none, one, least] = [0.0, 1.0, LEAST_GRADIENT].map(|x| Floats::new(simd, x));
-        for v in 0..a.output / S::F32_LANES {
+        for v in 0..floats / S::F32_LANES {
             let g = output.at(v);
             // A factor, since compilers make a masked store of a choice, which takes tens of cycles with AVX2.
             output.set(v, none.where_greater(least, g.abs(), one) * g);
         }
+        let (tile, grad) = (&a.values[at * a.stride..], &mut a.grads[a.waiting * a.stride..][..a.end]);
         match packed {
-            Packed::Vector(packed) => {
-                let (tile, pairs) = (&a.values[at * a.stride..][..a.end], cast_slice_mut(&mut a.pairs));
-                packed.backward(simd, &self.layers, tile, grad, ahead, pairs);
-                a.waiting += 1;
-                // Those of a chunk that begins a strip may wait for the next chunk; others are not where it will be.
-                if a.waiting >= a.strip || last && a.waiting <= n {
-                    self.sum(simd, a, at + 1 - a.waiting);
-                }
+            Packed::Vector(packed) => packed.backward(simd, &self.layers, &tile[..a.end], grad, ahead),
+            Packed::Rounded(packed) => {
+                let (tile, grad) = (cast_slice(&tile[..a.end]), cast_slice_mut(grad));
+                let (output, inputs) = a.row_grads.split_at_mut(a.output);
+                let (input, again) = inputs[..2 * a.input].split_at_mut(a.input);
+                packed.backward(&self.layers, tile, grad, output, [input, again], ahead);
             }
             Packed::Matrix(packed) => {
                 packed.backward(unit, &self.layers, grad, &mut a.saved, n);
@@ -278,17 +282,28 @@ impl Mlp {
                     let sums = a.sums.of(self.parameters());
                     packed.accumulate(unit, &self.layers, &mut a.saved, a.tiles, sums);
                 }
+                return;
             }
+        }
+        a.waiting += 1;
+        // Those of a chunk that begins a strip may wait for the next chunk; others are not where it will be.
+        if a.waiting >= a.strip || last && a.waiting <= n {
+            self.sum(simd, a, at + 1 - a.waiting);
         }
     }
 
     /// Sums the gradients of the tiles that wait for it, the first of which is number `first` of those kept.
     #[inline(always)]
     fn sum<S: Simd>(&self, simd: S, a: &mut Activations, first: usize) {
-        let view = |data| TileView { data, stride: a.stride, offset: 0 };
-        let (values, grads) = (view(&a.values[first * a.stride..]), view(&a.grads));
+        let (values, grads, stride) = (&a.values[first * a.stride..], &*a.grads, a.stride);
         let count = std::mem::take(&mut a.waiting);
-        a.sums.add(simd, &self.layers, Strip { values, grads, count }, a.rounded);
+        if a.rounded {
+            let view = |data| TileView { data: cast_slice(data), stride, offset: 0 };
+            a.sums.add_rounded(&self.layers, Strip { values: view(values), grads: view(grads), count });
+        } else {
+            let view = |data| TileView { data, stride, offset: 0 };
+            a.sums.add(simd, &self.layers, Strip { values: view(values), grads: view(grads), count });
+        }
     }
 
     /// Adds the parameter gradients of all tiles that have gone [`Self::backward`] to `out`, in the order of the parameters.
@@ -298,7 +313,7 @@ impl Mlp {
             self.sum(simd, a, 0);
         }
         match packed {
-            Packed::Vector(_) => a.sums.unpack::<S>(&self.layers, out),
+            Packed::Vector(_) | Packed::Rounded(_) => a.sums.unpack::<S>(&self.layers, out),
             Packed::Matrix(_) => a.sums.add_to(out),
         }
     }
@@ -334,28 +349,26 @@ impl Layer {
 
 /// Weights in the orders that the kernels stream through.
 pub enum Packed {
-    /// For [`Arithmetic::Single`] and [`Arithmetic::Rounded`].
+    /// For [`Arithmetic::Single`].
     Vector(vector::Packed),
+    /// For [`Arithmetic::Rounded`].
+    Rounded(rounded::Packed),
     /// For [`Arithmetic::Matrix`].
     Matrix(matrix::Packed),
 }
 
 impl Packed {
-    /// Whether they are for [`Arithmetic::Rounded`].
-    fn is_rounded(&self) -> bool {
-        matches!(self, Self::Vector(packed) if packed.is_rounded())
-    }
-
     /// Whether every tile's inputs and outputs stay after others have been evaluated.
     pub fn keeps_tiles(&self) -> bool {
-        matches!(self, Self::Vector(_))
+        !matches!(self, Self::Matrix(_))
     }
 }
 
 /// Activations of a chunk of tiles, and their gradients.
 #[derive(Default)]
 pub struct Activations {
-    /// Per tile `input | layer 1 | ... | output`, with the input again where a layer sees it; in bf16 all tiles share `input | output`.
+    /// Per tile `input | layer 1 | ... | output`, with the input again where a layer sees it; for matrix units all tiles share `input |
+    /// output`.
     values: AlignedVec,
     grads: AlignedVec,
     /// Floats from one tile to the next, and of one tile.
@@ -375,19 +388,24 @@ pub struct Activations {
     input: usize,
     output: usize,
     saved: matrix::Saved,
-    /// Whether factors are rounded to bf16, and what is rounded for a product.
+    /// Whether all but the outputs of tiles is rounded to bf16, in pairs of rows.
     rounded: bool,
-    pairs: AlignedVec,
+    /// Then, the f32 rows of the latest tile's input, and the gradients `output | input` with room for the input's again.
+    rows: AlignedVec,
+    row_grads: AlignedVec,
 }
 
 impl Activations {
-    /// Input rows of tile `n`, to be filled.
+    /// Input rows of tile `n`, to be filled right before it is evaluated.
     #[inline(always)]
     pub fn input(&mut self, n: usize) -> &mut [f32] {
+        if self.rounded {
+            return &mut self.rows[..self.input];
+        }
         &mut self.values[(self.first + n) * self.stride..][..self.input]
     }
 
-    /// Output rows of tile `n`; in bf16 only until the next tile is evaluated.
+    /// Output rows of tile `n`; with matrix units only until the next tile is evaluated.
     #[inline(always)]
     pub fn output(&self, n: usize) -> &[f32] {
         &self.values[(self.first + n) * self.stride + self.end - self.output..][..self.output]
@@ -396,12 +414,18 @@ impl Activations {
     /// Gradient of the output rows of the tile that goes backward next, to be filled.
     #[inline(always)]
     pub fn output_grad(&mut self) -> &mut [f32] {
+        if self.rounded {
+            return &mut self.row_grads[..self.output];
+        }
         &mut self.grads[self.waiting * self.stride + self.end - self.output..][..self.output]
     }
 
     /// Gradient of the input rows of the tile that went backward last.
     #[inline(always)]
     pub fn input_grad(&self) -> &[f32] {
+        if self.rounded {
+            return &self.row_grads[self.output..][..self.input];
+        }
         &self.grads[self.latest * self.stride..][..self.input]
     }
 

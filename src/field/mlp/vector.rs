@@ -1,60 +1,42 @@
-//! Networks on vectors of samples, in f32 or with factors rounded to bf16.
+//! Networks in f32, on vectors of samples.
 //!
 //! A tile holds all its layers one after the other: `input | layer 1 | layer 2 | ...`, gradients likewise. Before a layer
 //! that sees the input again, there is a copy of it.
 
-use std::ops::Range;
-
 use pulp::Simd;
 
 use super::{BLOCK, Layer, is_like_avx2};
-use crate::simd::dots::{self, pair};
-use crate::simd::matrix::Pairs;
 use crate::simd::{Finish, Product, TILE, multiply, prefetch_rows};
 
-/// Weights in the two orders that the kernels stream through.
+/// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
 pub struct Packed {
-    forward: Weights,
-    backward: Weights,
+    forward: Vec<f32>,
+    backward: Vec<f32>,
     bias: Vec<f32>,
 }
 
-/// Weights of all layers, four outputs (or inputs) side by side.
-enum Weights {
-    /// f32, one input after the other.
-    Single(Vec<f32>),
-    /// bf16, two inputs after the other two.
-    Pairs(Vec<Pairs>),
-}
-
 impl Packed {
-    pub(super) fn new(layers: &[Layer], params: &[f32], rounded: bool) -> Self {
-        let (mut forward, mut backward, mut bias) = (Vec::new(), Vec::new(), Vec::new());
+    pub(super) fn new(layers: &[Layer], params: &[f32]) -> Self {
+        let mut packed = Self { forward: Vec::new(), backward: Vec::new(), bias: Vec::new() };
         for layer in layers {
             let (w, b) = params[layer.param..].split_at(layer.weights());
-            bias.extend_from_slice(&b[..layer.n_out]);
+            packed.bias.extend_from_slice(&b[..layer.n_out]);
             for o in (0..layer.n_out).step_by(BLOCK) {
                 for i in 0..layer.n_in {
-                    forward.extend((0..BLOCK).map(|j| w[(o + j) * layer.n_in + i]));
+                    packed.forward.extend((0..BLOCK).map(|j| w[(o + j) * layer.n_in + i]));
                 }
             }
             for i in (0..layer.n_in).step_by(BLOCK) {
                 for o in 0..layer.n_out {
-                    backward.extend((0..BLOCK).map(|j| w[o * layer.n_in + i + j]));
+                    packed.backward.extend((0..BLOCK).map(|j| w[o * layer.n_in + i + j]));
                 }
             }
         }
-        let [forward, backward] = [forward, backward].map(|w| Weights::new(w, rounded));
-        Self { forward, backward, bias }
-    }
-
-    /// Whether factors are rounded to bf16.
-    pub(super) fn is_rounded(&self) -> bool {
-        matches!(self.forward, Weights::Pairs(_))
+        packed
     }
 
     /// Fills all rows below the input of one tile, `[rows][TILE]`; of the output the first `outputs` (a multiple of
-    /// [`BLOCK`]). Meanwhile the tile `ahead` floats behind it may be asked for. In `pairs` is room for what is rounded.
+    /// [`BLOCK`]). Meanwhile the tile `ahead` floats behind it may be asked for.
     #[inline(always)]
     pub(super) fn forward<S: Simd>(
         &self,
@@ -63,7 +45,6 @@ impl Packed {
         tile: &mut [f32],
         outputs: usize,
         ahead: usize,
-        pairs: &mut [Pairs],
     ) {
         for (n, layer) in layers.iter().enumerate() {
             let n_out = if n + 1 < layers.len() { layer.n_out } else { outputs };
@@ -71,17 +52,16 @@ impl Packed {
                 tile.copy_within(..layer.again * TILE, (layer.row + layer.fresh()) * TILE);
             }
             let (x, y) = tile[layer.row * TILE..].split_at_mut(layer.n_in * TILE);
-            let weights = layer.weight..layer.weight + layer.n_in * n_out;
+            let w = &self.forward[layer.weight..][..layer.n_in * n_out];
             let bias = &self.bias[layer.bias..][..n_out];
             let finish = if n + 1 < layers.len() { Finish::Relu } else { Finish::Plain };
             let ahead = y.as_ptr().wrapping_add(ahead);
-            let product = Product { w: &[], bias, x, finish, ahead };
-            self.forward.multiply(simd, weights, product, pairs, &mut y[..n_out * TILE]);
+            matmul(simd, Product { w, bias, x, finish, ahead }, &mut y[..n_out * TILE]);
         }
     }
 
     /// Fills the gradient rows of one tile above the output, whose rows the caller has set. Meanwhile the tile `ahead` floats behind
-    /// `tile` may be asked for. In `pairs` is room for what is rounded.
+    /// `tile` may be asked for.
     #[inline(always)]
     pub(super) fn backward<S: Simd>(
         &self,
@@ -90,21 +70,19 @@ impl Packed {
         tile: &[f32],
         grad: &mut [f32],
         ahead: usize,
-        pairs: &mut [Pairs],
     ) {
         for (n, layer) in layers.iter().enumerate().rev() {
             let (dx, dy) = grad[layer.row * TILE..].split_at_mut(layer.n_in * TILE);
+            let w = &self.backward[layer.weight..][..layer.weights()];
             let (fresh, again) = dx.split_at_mut(layer.fresh() * TILE);
-            let of_again = layer.weight + layer.fresh() * layer.n_out;
+            let (w, w_again) = w.split_at(layer.fresh() * layer.n_out);
             let dy = &dy[..layer.n_out * TILE];
             let x = &tile[layer.row * TILE..][..layer.fresh() * TILE];
             let finish = if n > 0 { Finish::Where(x) } else { Finish::Plain };
-            let product = Product { w: &[], bias: &[], x: dy, finish, ahead: x.as_ptr().wrapping_add(ahead) };
-            self.backward.multiply(simd, layer.weight..of_again, product, pairs, fresh);
+            let product = Product { w, bias: &[], x: dy, finish, ahead: x.as_ptr().wrapping_add(ahead) };
+            matmul(simd, product, fresh);
             if layer.again > 0 {
-                let product = Product { finish: Finish::Plain, ..product };
-                let weights = of_again..layer.weight + layer.weights();
-                self.backward.multiply(simd, weights, product, pairs, again);
+                matmul(simd, Product { w: w_again, finish: Finish::Plain, ..product }, again);
             }
         }
         for layer in layers.iter().filter(|l| l.again > 0) {
@@ -112,38 +90,6 @@ impl Packed {
             let again = &rest[(layer.row + layer.fresh() - layers[0].n_in) * TILE..];
             for (g, again) in input.iter_mut().zip(again) {
                 *g += again;
-            }
-        }
-    }
-}
-
-impl Weights {
-    /// Of layers whose numbers of inputs and of outputs are multiples of [`BLOCK`].
-    fn new(weights: Vec<f32>, rounded: bool) -> Self {
-        if !rounded {
-            return Self::Single(weights);
-        }
-        let two_inputs = weights.as_chunks::<{ 2 * BLOCK }>().0;
-        Self::Pairs(two_inputs.iter().flat_map(|w| (0..BLOCK).map(|j| pair(w[j], w[BLOCK + j]))).collect())
-    }
-
-    /// Computes `product` with those weights whose numbers are `of`; in `pairs` is room for its x.
-    #[inline(always)]
-    fn multiply<S: Simd>(
-        &self,
-        simd: S,
-        of: Range<usize>,
-        product: Product,
-        pairs: &mut [Pairs],
-        y: &mut [f32],
-    ) {
-        match self {
-            Self::Single(w) => matmul(simd, Product { w: &w[of], ..product }, y),
-            Self::Pairs(w) => {
-                let Product { bias, x, finish, ahead, .. } = product;
-                let pairs = &mut pairs[..x.len() / 2];
-                dots::pair_rows(x, pairs);
-                dots::multiply(Product { w: &w[of.start / 2..of.end / 2], bias, x: pairs, finish, ahead }, y);
             }
         }
     }

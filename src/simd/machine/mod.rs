@@ -78,13 +78,13 @@ fn columns_one_by_one(rows: &[f32], width: usize, out: &mut [f32]) {
 
 /// What becomes of a sum before it is written.
 #[derive(Clone, Copy)]
-pub enum Finish<'a> {
+pub enum Finish<'a, T = f32> {
     /// Nothing.
     Plain,
     /// Negative ones are 0.
     Relu,
     /// 0 except where these rows, of the same place as the output, are positive: the way back through a ReLU.
-    Where(&'a [f32]),
+    Where(&'a [T]),
 }
 
 /// y = W x + b for one tile, finished.
@@ -97,7 +97,7 @@ pub struct Product<'a, T = f32> {
     /// x `[input][TILE]`.
     pub x: &'a [T],
     /// What becomes of y.
-    pub finish: Finish<'a>,
+    pub finish: Finish<'a, T>,
     /// As many rows as y has are asked for from here on meanwhile, since they are needed later; they may be anywhere.
     pub ahead: *const f32,
 }

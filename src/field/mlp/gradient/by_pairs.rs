@@ -1,48 +1,41 @@
-//! Sums over vectors of samples of which both factors are rounded to bf16, in pairs of samples; kept as those of [`by_samples`].
+//! Sums over pairs of samples, of activations and gradients that are rounded to bf16; kept as those of [`super::by_samples`].
 
 use bytemuck::cast_slice_mut;
-use pulp::Simd;
 
 use super::super::{BLOCK, Layer};
-use super::by_samples::{Partial, bias_gradient, parts};
+use super::by_samples::{Partial, parts};
 use super::{Strip, inputs_together};
-use crate::simd::dots::{LANES, outer_product, pair_samples, pairs_of};
+use crate::simd::dots::{LANES, outer_product, pair, pair_samples, pairs_of};
 use crate::simd::matrix::Pairs;
 use crate::simd::{AlignedVec, add_quarter_sums};
 
-/// Adds the parameter gradients of a strip to `sums`, in the order of [`super::by_samples::accumulate`]; what is rounded goes to `rounded`.
+/// Adds the parameter gradients of a strip to `sums`, in the order of [`super::by_samples::accumulate`]. Pairs of samples are made in
+/// `panel`.
 #[inline(always)]
-pub fn accumulate<S: Simd>(
-    simd: S,
-    layers: &[Layer],
-    strip: Strip,
-    sums: &mut [f32],
-    rounded: &mut AlignedVec,
-) {
+pub fn accumulate(layers: &[Layer], strip: Strip<Pairs>, sums: &mut [f32], panel: &mut AlignedVec) {
     let stride = pairs_of(strip.count);
     let widest = layers.iter().map(|l| l.n_in + l.n_out).max().unwrap_or(0);
-    rounded.reserve_len(widest * stride);
-    let rounded: &mut [Pairs] = cast_slice_mut(rounded);
+    panel.reserve_len((widest + 1) * stride);
+    // Biases are weights of an input that is 1; beyond the last sample, gradients are 0.
+    let (ones, panel) = cast_slice_mut::<_, Pairs>(panel).split_at_mut(stride);
+    ones.fill(pair(1.0, 1.0));
     for layer in layers {
         let (weights, biases) = parts(sums, layer);
-        let [x, dy] = strip.of(layer);
-        for (block, bias) in biases.iter_mut().enumerate() {
-            bias_gradient(simd, dy.rows(block * BLOCK), strip.count, bias);
-        }
-        let (x_pairs, dy_pairs) =
-            rounded[..(layer.n_in + layer.n_out) * stride].split_at_mut(layer.n_in * stride);
+        let (x, dy) = panel[..(layer.n_in + layer.n_out) * stride].split_at_mut(layer.n_in * stride);
         for tile in 0..strip.count {
-            pair_samples(x.of(tile, layer.n_in), [tile, strip.count], x_pairs);
-            pair_samples(dy.of(tile, layer.n_out), [tile, strip.count], dy_pairs);
+            let of = [tile, strip.count];
+            pair_samples(strip.values.rows(layer.row / 2).of(tile, layer.n_in / 2), of, x);
+            pair_samples(strip.grads.rows((layer.row + layer.n_in) / 2).of(tile, layer.n_out / 2), of, dy);
+        }
+        for (dy, bias) in dy.chunks_exact(BLOCK * stride).zip(biases) {
+            add_product::<1>(dy, ones, stride, std::slice::from_mut(bias));
         }
         // The inputs, of which there are more at a time than outputs, stay in the nearest cache while all outputs pass.
         let mut i = 0;
         while i < layer.n_in {
             let wide = inputs_together(layer.n_in - i);
-            let x = &x_pairs[i * stride..];
-            for (dy, weights) in
-                dy_pairs.chunks_exact(BLOCK * stride).zip(weights.chunks_exact_mut(layer.n_in))
-            {
+            let x = &x[i * stride..];
+            for (dy, weights) in dy.chunks_exact(BLOCK * stride).zip(weights.chunks_exact_mut(layer.n_in)) {
                 let out = &mut weights[i..i + wide];
                 match wide {
                     6 => add_product::<6>(dy, x, stride, out),

@@ -134,7 +134,7 @@ fn outputs_by_inputs<S: Simd, const OUTPUTS: usize, const INPUTS: usize>(
 
 /// Adds Σ over samples of dy[j] to `out`.
 #[inline(always)]
-pub fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Partial) {
+fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Partial) {
     let vectors = TILE / S::F32_LANES;
     // Sums of their own for every third vector, so that none waits for the one before it.
     let mut acc = [[simd.splat_f32s(0.0); BLOCK]; 3];

@@ -11,6 +11,7 @@ mod by_samples;
 use pulp::Simd;
 
 use super::{Layer, is_like_avx2};
+use crate::simd::matrix::Pairs;
 use crate::simd::{AlignedVec, TILE};
 
 /// Most tiles whose gradients are kept until those of the weights are summed: with what was evaluated there, they stay near
@@ -18,7 +19,7 @@ use crate::simd::{AlignedVec, TILE};
 #[inline(always)]
 pub fn strip<S: Simd>(rounded: bool) -> usize {
     if rounded {
-        18
+        12
     } else if is_like_avx2::<S>() {
         // Sums have no end, so that the nearest cache may decide.
         2
@@ -56,18 +57,25 @@ impl Sums {
         &mut self.values[..len]
     }
 
-    /// Adds the gradients of a strip, of factors that are `rounded` to bf16 or not: always one or the other.
+    /// Adds the gradients of a strip.
     #[inline(always)]
-    pub fn add<S: Simd>(&mut self, simd: S, layers: &[Layer], strip: Strip, rounded: bool) {
-        self.rounded = rounded;
+    pub fn add<S: Simd>(&mut self, simd: S, layers: &[Layer], strip: Strip) {
+        self.rounded = false;
         let mut panel = std::mem::take(&mut self.panel);
-        if rounded {
-            by_pairs::accumulate(simd, layers, strip, self.of(by_samples::len(layers)), &mut panel);
-        } else if is_like_avx2::<S>() {
+        if is_like_avx2::<S>() {
             by_outputs::accumulate(simd, layers, strip, self.of(by_outputs::len(layers)), &mut panel);
         } else {
             by_samples::accumulate(simd, layers, strip, self.of(by_samples::len(layers)));
         }
+        self.panel = panel;
+    }
+
+    /// As [`Self::add`], of a strip that is rounded to bf16, in pairs of rows: always one or the other.
+    #[inline(always)]
+    pub fn add_rounded(&mut self, layers: &[Layer], strip: Strip<Pairs>) {
+        self.rounded = true;
+        let mut panel = std::mem::take(&mut self.panel);
+        by_pairs::accumulate(layers, strip, self.of(by_samples::len(layers)), &mut panel);
         self.panel = panel;
     }
 
@@ -102,11 +110,11 @@ fn inputs_together(left: usize) -> usize {
 
 /// Tiles that have gone back through the networks and whose parameter gradients are yet to be summed.
 #[derive(Clone, Copy)]
-pub struct Strip<'a> {
+pub struct Strip<'a, T = f32> {
     /// Their activations.
-    pub values: TileView<'a>,
+    pub values: TileView<'a, T>,
     /// The gradients of those.
-    pub grads: TileView<'a>,
+    pub grads: TileView<'a, T>,
     /// How many they are.
     pub count: usize,
 }
@@ -121,16 +129,16 @@ impl<'a> Strip<'a> {
 
 /// The same rows of many tiles: `data[tile * stride + row * TILE ..]`.
 #[derive(Clone, Copy)]
-pub struct TileView<'a> {
+pub struct TileView<'a, T = f32> {
     /// Tiles one after the other.
-    pub data: &'a [f32],
-    /// Floats from one tile to the next.
+    pub data: &'a [T],
+    /// Numbers from one tile to the next.
     pub stride: usize,
-    /// Float offset of row 0 within a tile.
+    /// Offset of row 0 within a tile.
     pub offset: usize,
 }
 
-impl<'a> TileView<'a> {
+impl<'a, T: Copy> TileView<'a, T> {
     /// The same from row `row` on.
     #[inline(always)]
     fn rows(self, row: usize) -> Self {
@@ -139,7 +147,7 @@ impl<'a> TileView<'a> {
 
     /// The first `rows` rows of tile `tile`.
     #[inline(always)]
-    fn of(self, tile: usize, rows: usize) -> &'a [f32] {
+    fn of(self, tile: usize, rows: usize) -> &'a [T] {
         &self.data[tile * self.stride + self.offset..][..rows * TILE]
     }
 }
