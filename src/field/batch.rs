@@ -1,11 +1,12 @@
 //! The samples of a chunk at which one stream is evaluated, and their encoding, level by level.
 
+use bytemuck::{cast_slice, cast_slice_mut};
 use glam::{Mat4, Vec3};
 
 use super::encoding::{Encoding, Level};
 use super::hashgrid::{AXES, Around, FEATURES, Points, Row, TIME};
 use crate::simd::lanes::{self, Layout};
-use crate::simd::{TILE, prefetch};
+use crate::simd::{TILE, fours_of_rows, prefetch, rows_of_fours};
 
 /// Bytes from a tile's rows of a level to the next tile's, which are needed after those of all other levels: the processor does not
 /// foresee it.
@@ -31,13 +32,10 @@ impl LevelRows {
     /// Writes the features of tile `tile` to `out`, a row of lanes a feature, as networks read them.
     #[inline(always)]
     pub fn read_tile(&self, tile: usize, out: &mut [f32]) {
-        let (rows, _) = self.rows[tile * TILE..][..TILE].as_chunks::<FEATURES>();
-        for (n, rows) in rows.iter().enumerate() {
-            prefetch(rows, NEXT_TILE);
-            let columns = transposed(*rows);
-            for k in 0..FEATURES {
-                out[k * TILE + n * FEATURES..][..FEATURES].copy_from_slice(&columns[k].to_array());
-            }
+        let (rows, out) = (&self.rows[tile * TILE..][..TILE], out.as_chunks_mut());
+        prefetch_tile(rows);
+        if let (Some(samples), Some(out)) = (cast_slice(rows).first_chunk(), out.0.first_chunk_mut()) {
+            rows_of_fours(samples, out);
         }
     }
 
@@ -45,12 +43,20 @@ impl LevelRows {
     /// [`Self::read_tile`].
     #[inline(always)]
     pub fn write_tile(&mut self, tile: usize, g: &[f32]) {
-        let (rows, _) = self.rows[tile * TILE..][..TILE].as_chunks_mut::<FEATURES>();
-        for (n, rows) in rows.iter_mut().enumerate() {
-            prefetch(rows, NEXT_TILE);
-            let column = |k: usize| Row::from_slice(&g[k * TILE + n * FEATURES..][..FEATURES]);
-            *rows = transposed([column(0), column(1), column(2), column(3)]);
+        let rows = &mut self.rows[tile * TILE..][..TILE];
+        prefetch_tile(rows);
+        if let (Some(g), Some(out)) = (g.as_chunks().0.first_chunk(), cast_slice_mut(rows).first_chunk_mut())
+        {
+            fours_of_rows(g, out);
         }
+    }
+}
+
+/// Asks for what stands a tile behind these rows of a tile.
+#[inline(always)]
+fn prefetch_tile(rows: &[Row]) {
+    for rows in rows.as_chunks::<FEATURES>().0 {
+        prefetch(rows, NEXT_TILE);
     }
 }
 

@@ -10,7 +10,10 @@ pub mod lanes;
 mod machine;
 pub mod matrix;
 
-pub use machine::{Finish, Product, add_quarter_sums, columns, multiply, prefetch, prefetch_rows};
+pub use machine::{
+    Finish, Product, add_quarter_sums, columns, fours_of_rows, multiply, prefetch, prefetch_rows,
+    rows_of_fours,
+};
 
 use bytemuck::{Pod, Zeroable};
 use half::f16;

@@ -191,3 +191,50 @@ fn transposed<const ROWS: usize>(rows: &[f32]) -> [__m256; EIGHT] {
     let [[a, b, c, d], [e, f, g, h]] = [columns(0), columns(4)];
     [a, b, c, d, e, f, g, h]
 }
+
+/// As [`super::rows_of_fours`].
+#[target_feature(enable = "avx512f")]
+pub fn rows_of_fours(samples: &[[f32; 4]; TILE], out: &mut [[f32; TILE]; 4]) {
+    // Numbers 0 of eight samples, and then numbers 1; or numbers 2, and then 3.
+    let first_two = _mm512_setr_epi32(0, 4, 8, 12, 16, 20, 24, 28, 1, 5, 9, 13, 17, 21, 25, 29);
+    let orders = [first_two, _mm512_add_epi32(first_two, _mm512_set1_epi32(2))];
+    for (n, samples) in samples.as_flattened().as_chunks::<LANES>().0.as_chunks::<4>().0.iter().enumerate() {
+        let [a, b, c, d] = [load(&samples[0]), load(&samples[1]), load(&samples[2]), load(&samples[3])];
+        for (order, out) in orders.into_iter().zip(out.as_chunks_mut::<2>().0) {
+            let (low, high) = (_mm512_permutex2var_ps(a, order, b), _mm512_permutex2var_ps(c, order, d));
+            store(_mm512_shuffle_f32x4::<0x44>(low, high), &mut out[0], n);
+            store(_mm512_shuffle_f32x4::<0xee>(low, high), &mut out[1], n);
+        }
+    }
+}
+
+/// As [`super::fours_of_rows`].
+#[target_feature(enable = "avx512f")]
+pub fn fours_of_rows(rows: &[[f32; TILE]; 4], out: &mut [[f32; 4]; TILE]) {
+    // Twos of eight samples, then of the next; fours of four samples, then of the next.
+    let twos = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+    let twos = [twos, _mm512_add_epi32(twos, _mm512_set1_epi32(8))];
+    let fours = _mm512_setr_epi64(0, 8, 1, 9, 2, 10, 3, 11);
+    let fours = [fours, _mm512_add_epi64(fours, _mm512_set1_epi64(4))];
+    for n in 0..TILE / LANES {
+        let row = |k: usize| load(&rows[k].as_chunks::<LANES>().0[n]);
+        let [a, b, c, d] = [row(0), row(1), row(2), row(3)];
+        for (half, order) in twos.into_iter().enumerate() {
+            let ab = _mm512_castps_pd(_mm512_permutex2var_ps(a, order, b));
+            let cd = _mm512_castps_pd(_mm512_permutex2var_ps(c, order, d));
+            for (part, order) in fours.into_iter().enumerate() {
+                let samples = _mm512_castpd_ps(_mm512_permutex2var_pd(ab, order, cd));
+                store(samples, out.as_flattened_mut(), 4 * n + 2 * half + part);
+            }
+        }
+    }
+}
+
+/// Writes vector number `n` of `out`.
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn store(v: __m512, out: &mut [f32], n: usize) {
+    let out = &mut out[n * LANES..][..LANES];
+    // SAFETY: as many floats as are written.
+    unsafe { _mm512_storeu_ps(out.as_mut_ptr(), v) };
+}

@@ -10,6 +10,8 @@ mod lanes;
 #[cfg(target_arch = "x86_64")]
 mod products;
 
+use glam::Mat4;
+
 use super::TILE;
 use super::lanes::Layout;
 
@@ -66,6 +68,44 @@ pub fn columns(rows: &[f32], width: usize, out: &mut [f32]) {
         return unsafe { lanes::columns(rows, width, out) };
     }
     columns_one_by_one(rows, width, out);
+}
+
+/// Writes a tile of samples, four numbers each, as four rows.
+#[inline(always)]
+pub fn rows_of_fours(samples: &[[f32; 4]; TILE], out: &mut [[f32; TILE]; 4]) {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        // SAFETY: this processor has the instructions.
+        return unsafe { lanes::rows_of_fours(samples, out) };
+    }
+    for (n, samples) in samples.as_chunks().0.iter().enumerate() {
+        let columns = transposed(samples);
+        for k in 0..4 {
+            out[k][4 * n..][..4].copy_from_slice(&columns[k]);
+        }
+    }
+}
+
+#[inline(always)]
+fn transposed(rows: &[[f32; 4]; 4]) -> [[f32; 4]; 4] {
+    Mat4::from_cols_array_2d(rows).transpose().to_cols_array_2d()
+}
+
+/// Writes four rows of a tile as four numbers a sample, the other way round than [`rows_of_fours`].
+#[inline(always)]
+pub fn fours_of_rows(rows: &[[f32; TILE]; 4], out: &mut [[f32; 4]; TILE]) {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        // SAFETY: this processor has the instructions.
+        return unsafe { lanes::fours_of_rows(rows, out) };
+    }
+    for (n, out) in out.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+        let mut four = [[0.0; 4]; 4];
+        for k in 0..4 {
+            four[k].copy_from_slice(&rows[k][4 * n..][..4]);
+        }
+        *out = transposed(&four);
+    }
 }
 
 fn columns_one_by_one(rows: &[f32], width: usize, out: &mut [f32]) {
@@ -167,6 +207,17 @@ mod tests {
             columns_one_by_one(&rows, width, &mut slow);
             assert_eq!(fast, slow);
         }
+    }
+
+    #[test]
+    fn fours_become_rows_and_rows_fours() {
+        let samples: [[f32; 4]; TILE] = std::array::from_fn(|n| std::array::from_fn(|k| (4 * n + k) as f32));
+        let mut rows = [[-1.0; TILE]; 4];
+        rows_of_fours(&samples, &mut rows);
+        assert!((0..4).all(|k| (0..TILE).all(|n| rows[k][n] == samples[n][k])));
+        let mut again = [[-1.0; 4]; TILE];
+        fours_of_rows(&rows, &mut again);
+        assert_eq!(again, samples);
     }
 
     #[test]
