@@ -168,18 +168,22 @@ fn outer_product_one_by_one<const INPUTS: usize>(
     x: &[Pairs],
     stride: usize,
 ) -> [[[f32; LANES]; BLOCK]; INPUTS] {
-    std::array::from_fn(|k| {
-        std::array::from_fn(|j| {
-            let [dy, x] = [&dy[j * stride..][..stride], &x[k * stride..][..stride]];
+    let mut out = [[[0.0; LANES]; BLOCK]; INPUTS];
+    for k in 0..INPUTS {
+        for j in 0..BLOCK {
+            let dy = dy[j * stride..][..stride].as_chunks::<LANES>().0;
+            let x = x[k * stride..][..stride].as_chunks::<LANES>().0;
+            // Sums of its own stay in registers.
             let mut sums = [0.0; LANES];
-            for (dy, x) in dy.as_chunks::<LANES>().0.iter().zip(x.as_chunks::<LANES>().0) {
+            for (dy, x) in dy.iter().zip(x) {
                 for n in 0..LANES {
                     sums[n] += dot(dy[n], x[n]);
                 }
             }
-            sums
-        })
-    })
+            out[k][j] = sums;
+        }
+    }
+    out
 }
 
 #[cfg(test)]
