@@ -147,7 +147,7 @@ fn output_row(Product { w, bias, x, finish, .. }: &Product<Pairs>, output: usize
     sums
 }
 
-/// Σ over samples of dy[j] x[k], of four rows dy and `INPUTS` rows x of pairs of samples, `stride` pairs each, but for the sum of
+/// Σ over samples of `dy[j] x[k]`, of four rows dy and `INPUTS` rows x of pairs of samples, `stride` pairs each, but for the sum of
 /// [`LANES`] parts: `[k][j][part]`.
 #[inline(always)]
 pub fn outer_product<const INPUTS: usize>(

@@ -349,11 +349,11 @@ impl Layer {
 
 /// Weights in the orders that the kernels stream through.
 pub enum Packed {
-    /// For [`Arithmetic::Single`].
+    /// For `Arithmetic::Single`.
     Vector(vector::Packed),
-    /// For [`Arithmetic::Rounded`].
+    /// For `Arithmetic::Rounded`.
     Rounded(rounded::Packed),
-    /// For [`Arithmetic::Matrix`].
+    /// For `Arithmetic::Matrix`.
     Matrix(matrix::Packed),
 }
 
