@@ -1,7 +1,7 @@
 //! The samples of a chunk at which one stream is evaluated, and their encoding, level by level.
 
 use bytemuck::{cast_slice, cast_slice_mut};
-use glam::{Mat4, Vec3};
+use glam::Vec3;
 
 use super::encoding::{Encoding, Level};
 use super::hashgrid::{AXES, Around, FEATURES, Points, Row, TIME};
@@ -11,13 +11,6 @@ use crate::simd::{TILE, fours_of_rows, prefetch, rows_of_fours};
 /// Bytes from a tile's rows of a level to the next tile's, which are needed after those of all other levels: the processor does not
 /// foresee it.
 const NEXT_TILE: usize = TILE * size_of::<Row>();
-
-/// Four rows of four numbers as columns.
-#[inline(always)]
-pub(super) fn transposed([a, b, c, d]: [Row; FEATURES]) -> [Row; FEATURES] {
-    let columns = Mat4::from_cols(a, b, c, d).transpose();
-    [columns.x_axis, columns.y_axis, columns.z_axis, columns.w_axis]
-}
 
 /// What one level says about a batch's samples; after the way back, the gradient with respect to it.
 #[derive(Default)]

@@ -8,14 +8,14 @@ use std::ops::Range;
 use glam::Vec3;
 use pulp::Simd;
 
-use super::batch::{StreamBatch, transposed};
+use super::batch::StreamBatch;
 use super::config::Widths;
 use super::encoding::Encoding;
 use super::hashgrid::{FEATURES, Row};
 use super::mlp::{Activations, Mlp, Packed};
 use crate::simd::floats::{Column, ColumnMut};
 use crate::simd::matrix::Unit;
-use crate::simd::{AlignedVec, TILE};
+use crate::simd::{AlignedVec, TILE, transposed};
 
 /// Raw densities are clamped to this before the exponential, so that neither σ nor its gradient overflows.
 const RAW_SIGMA_LIMIT: f32 = 15.0;

@@ -16,6 +16,7 @@ pub use machine::{
 };
 
 use bytemuck::{Pod, Zeroable};
+use glam::{Mat4, Vec4};
 use half::f16;
 
 use self::floats::Floats;
@@ -26,6 +27,13 @@ use self::floats::Floats;
 /// multiply-add on two ports. With AVX2's sixteen, too, but there [`multiply`] says which register is for what; elsewhere it takes two by
 /// four, since sums that do not fit go through memory.
 pub const TILE: usize = 48;
+
+/// Four rows of four numbers as columns.
+#[inline(always)]
+pub fn transposed([a, b, c, d]: [Vec4; 4]) -> [Vec4; 4] {
+    let columns = Mat4::from_cols(a, b, c, d).transpose();
+    [columns.x_axis, columns.y_axis, columns.z_axis, columns.w_axis]
+}
 
 /// One cache line of floats; gives [`AlignedVec`] its alignment.
 #[derive(Clone, Copy, Pod, Zeroable)]

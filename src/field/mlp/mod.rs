@@ -313,7 +313,7 @@ impl Mlp {
             self.sum(simd, a, 0);
         }
         match packed {
-            Packed::Vector(_) | Packed::Rounded(_) => a.sums.unpack::<S>(&self.layers, out),
+            Packed::Vector(_) | Packed::Rounded(_) => a.sums.unpack::<S>(&self.layers, a.rounded, out),
             Packed::Matrix(_) => a.sums.add_to(out),
         }
     }

@@ -3,7 +3,7 @@
 //! A tile holds what each of its layers sees, one after the other and in pairs of neighbouring rows, then the output in f32. Before a
 //! layer that sees the input again, there is a copy of it. Of gradients there are those of what comes out of layers, at the same places.
 
-use super::{BLOCK, Layer};
+use super::{BLOCK, Layer, vector};
 use crate::simd::dots::{multiply, multiply_to_pairs, pair, pair_rows};
 use crate::simd::matrix::Pairs;
 use crate::simd::{Finish, Product, TILE};
@@ -20,25 +20,16 @@ fn pairs(row: usize) -> usize {
     row / 2 * TILE
 }
 
+/// Weights `[block][input][4]`, rounded, as `[block][input / 2][4]`.
+fn rounded(weights: &[f32]) -> Vec<Pairs> {
+    let two_inputs = weights.as_chunks::<{ 2 * BLOCK }>().0;
+    two_inputs.iter().flat_map(|w| (0..BLOCK).map(|j| pair(w[j], w[BLOCK + j]))).collect()
+}
+
 impl Packed {
     pub(super) fn new(layers: &[Layer], params: &[f32]) -> Self {
-        let mut packed = Self { forward: Vec::new(), backward: Vec::new(), bias: Vec::new() };
-        for layer in layers {
-            let (w, b) = params[layer.param..].split_at(layer.weights());
-            packed.bias.extend_from_slice(&b[..layer.n_out]);
-            let at = |o: usize, i: usize| w[o * layer.n_in + i];
-            for o in (0..layer.n_out).step_by(BLOCK) {
-                for i in (0..layer.n_in).step_by(2) {
-                    packed.forward.extend((o..o + BLOCK).map(|o| pair(at(o, i), at(o, i + 1))));
-                }
-            }
-            for i in (0..layer.n_in).step_by(BLOCK) {
-                for o in (0..layer.n_out).step_by(2) {
-                    packed.backward.extend((i..i + BLOCK).map(|i| pair(at(o, i), at(o + 1, i))));
-                }
-            }
-        }
-        packed
+        let vector::Packed { forward, backward, bias } = vector::Packed::new(layers, params);
+        Self { forward: rounded(&forward), backward: rounded(&backward), bias }
     }
 
     /// From the `input` rows of a tile `[input][TILE]` to all of `tile`; of the `output` the first rows, a multiple of [`BLOCK`].

@@ -10,9 +10,9 @@ use crate::simd::{Finish, Product, TILE, multiply, prefetch_rows};
 
 /// Weights in the two orders that the kernels stream through, four outputs (or inputs) side by side.
 pub struct Packed {
-    forward: Vec<f32>,
-    backward: Vec<f32>,
-    bias: Vec<f32>,
+    pub(super) forward: Vec<f32>,
+    pub(super) backward: Vec<f32>,
+    pub(super) bias: Vec<f32>,
 }
 
 impl Packed {

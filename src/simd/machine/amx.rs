@@ -7,6 +7,7 @@ use std::arch::asm;
 use std::marker::PhantomData;
 use std::sync::OnceLock;
 
+use super::dots::{Dots, INTERLEAVED, load_order};
 use crate::simd::matrix::{Keep, Narrowed, PANEL, Pairs, TILE_ROWS};
 
 /// Bytes of a tile register's row: 32 bf16, 16 pairs of them or 16 f32.
@@ -26,9 +27,7 @@ fn has_instructions() -> bool {
     const BF16: u32 = 1 << 22;
     let leaves = std::arch::x86_64::__cpuid(0).eax;
     let has = leaves >= 7 && std::arch::x86_64::__cpuid_count(7, 0).edx & (TILE | BF16) == TILE | BF16;
-    has && is_x86_feature_detected!("avx512f")
-        && is_x86_feature_detected!("avx512bw")
-        && is_x86_feature_detected!("avx512bf16")
+    has && Dots::new().is_some()
 }
 
 /// Asks Linux for the tiles' 8 KiB of state, for all threads; a kernel that grants it saves it on every switch.
@@ -189,18 +188,9 @@ impl Tiles {
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 unsafe fn narrow(rows: &[f32; 2 * PANEL], bias: [f32; 2], keep: Keep, mut out: Narrowed) {
     use std::arch::x86_64::*;
-    const INTERLEAVE: [u16; 32] = {
-        let mut order = [0; 32];
-        let mut k = 0;
-        while k < 32 {
-            order[k] = (k / 2 + k % 2 * 16) as u16;
-            k += 1;
-        }
-        order
-    };
-    // SAFETY: every load and store is of 16 or 32 numbers from `v` on, within rows of 48 (or the constant's 32).
+    let interleaved = load_order(&INTERLEAVED);
+    // SAFETY: every load and store is of 16 numbers from `v` on, within rows of 48.
     unsafe {
-        let interleave = _mm512_loadu_si512(INTERLEAVE.as_ptr().cast());
         for v in (0..PANEL).step_by(16) {
             let mut low = _mm512_add_ps(_mm512_loadu_ps(rows.as_ptr().add(v)), _mm512_set1_ps(bias[0]));
             let mut high =
@@ -220,7 +210,7 @@ unsafe fn narrow(rows: &[f32; 2 * PANEL], bias: [f32; 2], keep: Keep, mut out: N
             let [a, b] = &mut out.rows;
             _mm256_storeu_si256(a.as_mut_ptr().add(v).cast(), _mm512_castsi512_si256(both));
             _mm256_storeu_si256(b.as_mut_ptr().add(v).cast(), _mm512_extracti64x4_epi64::<1>(both));
-            let pairs = _mm512_permutexvar_epi16(interleave, both);
+            let pairs = _mm512_permutexvar_epi16(interleaved, both);
             _mm512_storeu_si512(out.pairs.as_mut_ptr().add(v).cast(), pairs);
         }
     }

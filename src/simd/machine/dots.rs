@@ -79,7 +79,7 @@ fn assert_fits(product: &Product<Pairs>, outputs: usize) {
 }
 
 /// Numbers of 16 bits of one vector, in the order that has each of the lower half before its fellow of the upper half.
-const INTERLEAVED: [u16; 2 * LANES] = {
+pub(super) const INTERLEAVED: [u16; 2 * LANES] = {
     let mut order = [0; 2 * LANES];
     let mut n = 0;
     while n < 2 * LANES {
@@ -102,7 +102,7 @@ const fn every_second(first: u16) -> [u16; 2 * LANES] {
 
 #[inline]
 #[target_feature(enable = "avx512f")]
-fn load_order(order: &[u16; 2 * LANES]) -> __m512i {
+pub(super) fn load_order(order: &[u16; 2 * LANES]) -> __m512i {
     // SAFETY: as many numbers as are read.
     unsafe { _mm512_loadu_si512(order.as_ptr().cast()) }
 }

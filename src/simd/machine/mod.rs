@@ -10,10 +10,10 @@ mod lanes;
 #[cfg(target_arch = "x86_64")]
 mod products;
 
-use glam::Mat4;
+use glam::Vec4;
 
-use super::TILE;
 use super::lanes::Layout;
+use super::{TILE, transposed};
 
 /// Asks for the cache line `bytes` behind `value` before it is needed; on other processors than x86-64, their own
 /// prediction has to do.
@@ -78,17 +78,12 @@ pub fn rows_of_fours(samples: &[[f32; 4]; TILE], out: &mut [[f32; TILE]; 4]) {
         // SAFETY: this processor has the instructions.
         return unsafe { lanes::rows_of_fours(samples, out) };
     }
-    for (n, samples) in samples.as_chunks().0.iter().enumerate() {
-        let columns = transposed(samples);
+    for (n, samples) in samples.as_chunks::<4>().0.iter().enumerate() {
+        let rows = transposed(samples.map(Vec4::from_array));
         for k in 0..4 {
-            out[k][4 * n..][..4].copy_from_slice(&columns[k]);
+            out[k][4 * n..][..4].copy_from_slice(&rows[k].to_array());
         }
     }
-}
-
-#[inline(always)]
-fn transposed(rows: &[[f32; 4]; 4]) -> [[f32; 4]; 4] {
-    Mat4::from_cols_array_2d(rows).transpose().to_cols_array_2d()
 }
 
 /// Writes four rows of a tile as four numbers a sample, the other way round than [`rows_of_fours`].
@@ -100,11 +95,8 @@ pub fn fours_of_rows(rows: &[[f32; TILE]; 4], out: &mut [[f32; 4]; TILE]) {
         return unsafe { lanes::fours_of_rows(rows, out) };
     }
     for (n, out) in out.as_chunks_mut::<4>().0.iter_mut().enumerate() {
-        let mut four = [[0.0; 4]; 4];
-        for k in 0..4 {
-            four[k].copy_from_slice(&rows[k][4 * n..][..4]);
-        }
-        *out = transposed(&four);
+        let row = |k: usize| Vec4::from_slice(&rows[k][4 * n..][..4]);
+        *out = transposed([row(0), row(1), row(2), row(3)]).map(|sample| sample.to_array());
     }
 }
 

@@ -37,8 +37,6 @@ pub fn strip<S: Simd>(rounded: bool) -> usize {
 pub struct Sums {
     values: AlignedVec,
     any: bool,
-    /// Whether they are of factors that are rounded to bf16.
-    rounded: bool,
     /// What vectors of outputs, or of rounded numbers, are made in.
     panel: AlignedVec,
 }
@@ -60,7 +58,6 @@ impl Sums {
     /// Adds the gradients of a strip.
     #[inline(always)]
     pub fn add<S: Simd>(&mut self, simd: S, layers: &[Layer], strip: Strip) {
-        self.rounded = false;
         let mut panel = std::mem::take(&mut self.panel);
         if is_like_avx2::<S>() {
             by_outputs::accumulate(simd, layers, strip, self.of(by_outputs::len(layers)), &mut panel);
@@ -73,17 +70,17 @@ impl Sums {
     /// As [`Self::add`], of a strip that is rounded to bf16, in pairs of rows: always one or the other.
     #[inline(always)]
     pub fn add_rounded(&mut self, layers: &[Layer], strip: Strip<Pairs>) {
-        self.rounded = true;
         let mut panel = std::mem::take(&mut self.panel);
         by_pairs::accumulate(layers, strip, self.of(by_samples::len(layers)), &mut panel);
         self.panel = panel;
     }
 
-    /// Adds what [`Self::add`] has summed to `out`, in the order of the parameters, and forgets it.
+    /// Adds what has been summed, by [`Self::add_rounded`] if it is `rounded` and else by [`Self::add`], to `out`, in the order of the
+    /// parameters, and forgets it.
     #[inline(always)]
-    pub fn unpack<S: Simd>(&mut self, layers: &[Layer], out: &mut [f32]) {
+    pub fn unpack<S: Simd>(&mut self, layers: &[Layer], rounded: bool, out: &mut [f32]) {
         if std::mem::take(&mut self.any) {
-            let by_outputs = is_like_avx2::<S>() && !self.rounded;
+            let by_outputs = is_like_avx2::<S>() && !rounded;
             let unpack = if by_outputs { by_outputs::unpack } else { by_samples::unpack };
             unpack(layers, &self.values, out);
         }
