@@ -138,8 +138,12 @@ impl WithSimd for TablePass<'_> {
     fn with_simd<S: Simd>(self, simd: S) {
         let Self(level, points, table) = self;
         match table {
-            Table::Encode(table, out) => level.encode(table, points, out, &mut Around::default()),
-            Table::Scatter(table, g) => level.scatter(table, points, g, &mut Around::default()),
+            Table::Encode(table, out) => {
+                level.encode(table, points.iter().zip(out.chunks_mut(TILE)), &mut Around::default())
+            }
+            Table::Scatter(table, g) => {
+                level.scatter(table, points.iter().zip(g.chunks(TILE)), &mut Around::default())
+            }
             Table::Update(state, table, gradient) => {
                 state.update(simd, table, gradient, StepSize::new(1e-3, 10));
             }
@@ -203,11 +207,18 @@ fn tables(c: &mut Criterion) {
 struct Wall(DensityGrid);
 
 impl Steer for Wall {
+    type Cells = [u32; STRIDE];
+
     #[inline(always)]
-    fn sigma(&self, points: &[[f32; STRIDE]; 3], _: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
-        let mut out = [0.0; STRIDE];
-        self.0.add_at(points, &[0; STRIDE], &mut out);
-        [out, [0.0; STRIDE]]
+    fn find(&self, points: &[Lanes; 3], _: &Lanes) -> [u32; STRIDE] {
+        let cells = self.0.indices(points, &[0; STRIDE]);
+        self.0.fetch(&cells);
+        cells
+    }
+
+    #[inline(always)]
+    fn sigma(&self, cells: &[u32; STRIDE]) -> [Lanes; 2] {
+        [self.0.of(cells), [0.0; STRIDE]]
     }
 }
 

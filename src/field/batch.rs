@@ -4,7 +4,7 @@ use bytemuck::{cast_slice, cast_slice_mut};
 use glam::Vec3;
 
 use super::encoding::{Encoding, Level};
-use super::hashgrid::{AXES, Around, FEATURES, Points, Row, TIME};
+use super::hashgrid::{AXES, Around, FEATURES, Points, Row, Slopes, TIME};
 use crate::simd::lanes::{self, Layout};
 use crate::simd::{TILE, fours_of_rows, prefetch, rows_of_fours};
 
@@ -18,7 +18,7 @@ pub struct LevelRows {
     /// A row a lane, whole tiles; behind them is what an earlier, larger batch has left.
     pub rows: Vec<Row>,
     /// Derivatives by x, y and z of the lanes, likewise, where the batch asks for them.
-    pub(super) slopes: Vec<[Row; 3]>,
+    pub(super) slopes: Vec<Slopes>,
 }
 
 impl LevelRows {
@@ -154,6 +154,11 @@ impl StreamBatch {
         self.sample.iter().enumerate().map(move |(n, s)| (*s as usize, at(n)))
     }
 
+    /// Positions tile by tile, and what level number `level` says about them, or the gradient with respect to that.
+    pub fn encoded(&self, level: usize) -> impl Iterator<Item = (&Points, &[Row])> {
+        self.pos.iter().zip(self.levels[level].rows[..self.len()].chunks(TILE))
+    }
+
     /// Encodes all samples.
     #[inline(always)]
     pub fn encode(&mut self, encoding: &Encoding, tables: &[Vec<Row>]) {
@@ -169,25 +174,26 @@ impl StreamBatch {
         levels.resize_with(encoding.levels.len(), LevelRows::default);
         let parts = encoding.levels.iter().zip(tables).zip(levels);
         parts
-            .map(|((level, table), out)| LevelTask {
-                level,
-                table,
-                pos,
-                lanes: sample.len(),
-                slopes: *slopes,
-                out,
+            .map(|((level, table), out)| {
+                let batch = LevelBatch { pos, lanes: sample.len(), slopes: *slopes, out };
+                LevelTask { level, table, batches: vec![batch] }
             })
             .collect()
     }
 }
 
-/// The encoding of one batch on one level.
+/// The encoding of batches on one level.
 ///
 /// Whoever has many batches does one level of all of them before the next: a level's table fits a core's L2, all of
 /// them together do not.
 pub struct LevelTask<'a> {
     level: &'a Level,
     table: &'a [Row],
+    batches: Vec<LevelBatch<'a>>,
+}
+
+/// Where one level is to say something about the samples of one batch.
+struct LevelBatch<'a> {
     pos: &'a [Points],
     lanes: usize,
     slopes: bool,
@@ -195,30 +201,49 @@ pub struct LevelTask<'a> {
 }
 
 impl LevelTask<'_> {
+    /// Takes the batches of `other`, which is of the same level.
+    pub fn append(&mut self, mut other: Self) {
+        self.batches.append(&mut other.batches);
+    }
+
     /// Rows that it looks up, or points where there are none.
     pub fn cost(&self) -> usize {
-        self.lanes * self.level.corners().max(1)
+        let lanes: usize = self.batches.iter().map(|batch| batch.lanes).sum();
+        lanes * self.level.corners().max(1)
     }
 
     /// Looks up and interpolates.
     #[inline(always)]
     pub fn run(self, around: &mut Around) {
-        let Self { level, table, pos, lanes, slopes, out } = self;
-        let wanted = pos.len() * TILE;
+        let Self { level, table, mut batches } = self;
+        batches.iter_mut().for_each(LevelBatch::make_room);
+        let (steep, flat): (Vec<_>, Vec<_>) = batches.into_iter().partition(|batch| batch.slopes);
+        level.encode(table, flat.into_iter().flat_map(LevelBatch::tiles), around);
+        level.encode_with_slopes(table, steep.into_iter().flat_map(LevelBatch::tiles_with_slopes), around);
+    }
+}
+
+impl<'a> LevelBatch<'a> {
+    /// Makes room for whole tiles, of which those lanes that are nobody's are zeros.
+    fn make_room(&mut self) {
+        let wanted = self.pos.len() * TILE;
         // What an earlier, larger batch has left behind is of no one's concern.
-        if out.rows.len() < wanted {
-            out.rows.resize(wanted, Row::ZERO);
+        if self.out.rows.len() < wanted {
+            self.out.rows.resize(wanted, Row::ZERO);
         }
-        out.rows[lanes..wanted].fill(Row::ZERO);
-        let rows = &mut out.rows[..lanes];
-        if slopes {
-            if out.slopes.len() < wanted {
-                out.slopes.resize(wanted, [Row::ZERO; 3]);
-            }
-            level.encode_with_slopes(table, pos, rows, &mut out.slopes, around);
-        } else {
-            level.encode(table, pos, rows, around);
+        self.out.rows[self.lanes..wanted].fill(Row::ZERO);
+        if self.slopes && self.out.slopes.len() < wanted {
+            self.out.slopes.resize(wanted, [Row::ZERO; 3]);
         }
+    }
+
+    fn tiles(self) -> impl Iterator<Item = (&'a Points, &'a mut [Row])> {
+        self.pos.iter().zip(self.out.rows[..self.lanes].chunks_mut(TILE))
+    }
+
+    fn tiles_with_slopes(self) -> impl Iterator<Item = (&'a Points, (&'a mut [Row], &'a mut [Slopes]))> {
+        let LevelRows { rows, slopes } = self.out;
+        self.pos.iter().zip(rows[..self.lanes].chunks_mut(TILE).zip(slopes.chunks_mut(TILE)))
     }
 }
 

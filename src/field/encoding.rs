@@ -5,7 +5,7 @@
 
 use std::f32::consts::PI;
 
-use super::hashgrid::{Around, FEATURES, HashGrid, Lattice, Points, Row};
+use super::hashgrid::{Around, FEATURES, HashGrid, Lattice, Points, Row, Slopes};
 use crate::simd::{TILE, sin_cos_pi};
 
 /// One row of features of a position.
@@ -73,54 +73,68 @@ impl Level {
         }
     }
 
-    /// Writes the features of `tiles` of points to `out`, a row a point; those that the last tile has too many are left out.
+    /// Writes the features of tiles of points, a row a point, to what belongs to each: of the lanes of a tile as many as that has rows.
     #[inline(always)]
-    pub fn encode(&self, table: &[Row], tiles: &[Points], out: &mut [Row], around: &mut Around) {
+    pub fn encode<'a>(
+        &self,
+        table: &[Row],
+        tiles: impl Iterator<Item = (&'a Points, &'a mut [Row])>,
+        around: &mut Around,
+    ) {
         if let Self::Lattice(lattice) = self {
-            return lattice.encode(table, tiles, out, around);
+            return lattice.encode(table, tiles, around);
         }
-        for (pos, out) in tiles.iter().zip(out.chunks_mut(TILE)) {
-            if let Self::Waves { axis, half_turns } = *self {
-                waves(&pos[axis], half_turns, out);
-                continue;
-            }
-            for (s, out) in out.iter_mut().enumerate() {
-                *out = Row::new(pos[0][s], pos[1][s], pos[2][s], 0.0);
-            }
-        }
+        tiles.for_each(|(pos, out)| self.write(pos, out));
     }
 
     /// As [`Self::encode`], and each point's derivatives of its features by x, y and z.
     #[inline(always)]
-    pub fn encode_with_slopes(
+    pub fn encode_with_slopes<'a>(
         &self,
         table: &[Row],
-        tiles: &[Points],
-        out: &mut [Row],
-        slopes: &mut [[Row; 3]],
+        tiles: impl Iterator<Item = (&'a Points, (&'a mut [Row], &'a mut [Slopes]))>,
         around: &mut Around,
     ) {
         if let Self::Lattice(lattice) = self {
-            return lattice.encode_with_slopes(table, tiles, out, slopes, around);
+            return lattice.encode_with_slopes(table, tiles, around);
         }
-        self.encode(table, tiles, out, around);
-        for (row, slopes) in out.iter().zip(slopes) {
-            *slopes = match *self {
-                Self::Waves { axis, half_turns } => {
-                    let mut slopes = [Row::ZERO; 3];
-                    slopes[axis] = PI * half_turns * Row::new(row.y, -row.x, 2.0 * row.w, -2.0 * row.z);
-                    slopes
-                }
-                _ => [Row::X, Row::Y, Row::Z],
-            };
+        for (pos, (out, slopes)) in tiles {
+            self.write(pos, out);
+            for (row, slopes) in out.iter().zip(slopes) {
+                *slopes = match *self {
+                    Self::Waves { axis, half_turns } => {
+                        let mut slopes = [Row::ZERO; 3];
+                        slopes[axis] = PI * half_turns * Row::new(row.y, -row.x, 2.0 * row.w, -2.0 * row.z);
+                        slopes
+                    }
+                    _ => [Row::X, Row::Y, Row::Z],
+                };
+            }
         }
     }
 
-    /// Adds the gradients `g` of the features of `tiles` to the rows that they were read from; nothing where none were.
+    /// Writes the features of a tile of points, where nothing is learned.
     #[inline(always)]
-    pub fn scatter(&self, grads: &mut [Row], tiles: &[Points], g: &[Row], around: &mut Around) {
+    fn write(&self, pos: &Points, out: &mut [Row]) {
+        if let Self::Waves { axis, half_turns } = *self {
+            return waves(&pos[axis], half_turns, out);
+        }
+        for (s, out) in out.iter_mut().enumerate() {
+            *out = Row::new(pos[0][s], pos[1][s], pos[2][s], 0.0);
+        }
+    }
+
+    /// Adds the gradients of the features of tiles of points, which belong to each, to the rows that they were read from; nothing where
+    /// none were.
+    #[inline(always)]
+    pub fn scatter<'a>(
+        &self,
+        grads: &mut [Row],
+        tiles: impl Iterator<Item = (&'a Points, &'a [Row])>,
+        around: &mut Around,
+    ) {
         if let Self::Lattice(lattice) = self {
-            lattice.scatter(grads, tiles, g, around);
+            lattice.scatter(grads, tiles, around);
         }
     }
 }
@@ -141,6 +155,8 @@ fn waves(x: &[f32; TILE], half_turns: f32, out: &mut [Row]) {
 
 #[cfg(test)]
 mod tests {
+    use std::iter::once;
+
     use glam::Vec3;
 
     use super::*;
@@ -183,7 +199,7 @@ mod tests {
             let pos = tile(seed);
             for (n, level) in encoding.levels.iter().enumerate() {
                 let mut rows = [Row::ZERO; TILE];
-                level.encode(&[], &[pos], &mut rows, &mut Around::default());
+                level.encode(&[], once((&pos, &mut rows[..])), &mut Around::default());
                 for (lane, row) in rows.iter().enumerate() {
                     let truth = &defined(at(&pos, lane))[n * FEATURES..];
                     for (a, b) in row.to_array().iter().zip(truth) {
@@ -201,9 +217,13 @@ mod tests {
         let pos = tile(100);
         for (n, level) in encoding.levels.iter().enumerate() {
             let (mut rows, mut slopes) = ([Row::ZERO; TILE], [[Row::ZERO; 3]; TILE]);
-            level.encode_with_slopes(&[], &[pos], &mut rows, &mut slopes, &mut Around::default());
+            level.encode_with_slopes(
+                &[],
+                once((&pos, (&mut rows[..], &mut slopes[..]))),
+                &mut Around::default(),
+            );
             let mut plain = [Row::ZERO; TILE];
-            level.encode(&[], &[pos], &mut plain, &mut Around::default());
+            level.encode(&[], once((&pos, &mut plain[..])), &mut Around::default());
             assert_eq!(rows, plain);
             for (lane, slopes) in slopes.iter().enumerate() {
                 for (axis, slope) in slopes.iter().enumerate() {
@@ -229,7 +249,8 @@ mod tests {
         for x in [1e3, -1e3, 1e9, f32::MAX, f32::MIN, f32::INFINITY, f32::NAN] {
             for level in &Encoding::frequency(BANDS).levels[1..] {
                 let mut rows = [Row::ZERO; TILE];
-                level.encode(&[], &[[[x; TILE]; AXES]], &mut rows, &mut Around::default());
+                let pos = [[x; TILE]; AXES];
+                level.encode(&[], once((&pos, &mut rows[..])), &mut Around::default());
                 assert!(x.is_nan() || rows[0].abs().max_element() < 1.001, "{x}: {}", rows[0]);
             }
         }

@@ -5,6 +5,8 @@
 //! hash. Levels are separate so that gradients can be scattered by one task a level, without atomics and in a fixed
 //! order.
 
+use std::mem::swap;
+
 use glam::{Vec3, Vec4};
 
 use crate::simd::{TILE, floor_within, prefetch};
@@ -12,14 +14,14 @@ use crate::simd::{TILE, floor_within, prefetch};
 /// Features per level: one 16-byte row.
 pub const FEATURES: usize = 4;
 
-/// Points from one that is looked up to the one whose rows are asked for: as many as the processor would not come to by itself.
-const AHEAD: usize = 8;
-
 /// One table row; a `Vec4` rather than an array because the compiler keeps it in one vector register.
 pub type Row = Vec4;
 
 /// Axes that lattices can span: three of space, and time.
 pub const AXES: usize = 4;
+
+/// Derivatives of a row of features by x, y and z.
+pub type Slopes = [Row; 3];
 
 /// The axis of time.
 pub const TIME: usize = 3;
@@ -54,19 +56,75 @@ struct Corners {
 }
 
 /// The corners around each point of a tile; for a lattice with time those before it and those after it.
-///
-/// A buffer: what encodes or scatters overwrites it, tile after tile.
-pub struct Around {
+#[derive(Clone)]
+struct Cells {
     before: Corners,
     after: Corners,
     /// Share of the latter.
     fraction: [f32; TILE],
 }
 
+/// The cells around the points of two tiles that follow each other: a buffer, which what encodes or scatters overwrites.
+pub struct Around([Cells; 2]);
+
 impl Default for Around {
     fn default() -> Self {
-        let none = Corners { rows: [[0; TILE]; 8], frac: [[0.0; TILE]; 3] };
-        Self { before: none.clone(), after: none, fraction: [0.0; TILE] }
+        let corners = Corners { rows: [[0; TILE]; 8], frac: [[0.0; TILE]; 3] };
+        let none = Cells { before: corners.clone(), after: corners, fraction: [0.0; TILE] };
+        Self([none.clone(), none])
+    }
+}
+
+/// Tiles of points and what belongs to each, with the cells around the points.
+///
+/// Those of a tile are found before the one before it is dealt with, so that its rows can be asked for meanwhile: they are too far
+/// apart for the processor to foresee, and a tile takes longer than the way to the farthest cache.
+struct Walk<'a, I, T> {
+    lattice: &'a Lattice,
+    tiles: I,
+    /// Around the points of the tile that [`Self::advance`] has given.
+    now: &'a mut Cells,
+    /// Around those of the tile behind it; behind the last, of one that was before.
+    next: &'a mut Cells,
+    /// What belongs to the latter.
+    waiting: Option<T>,
+}
+
+impl<'a, 'p, T, I: Iterator<Item = (&'p Points, T)>> Walk<'a, I, T> {
+    #[inline(always)]
+    fn new(lattice: &'a Lattice, table: &[Row], tiles: I, around: &'a mut Around) -> Self {
+        let Around([now, next]) = around;
+        let mut walk = Self { lattice, tiles, now, next, waiting: None };
+        walk.look();
+        (0..TILE).for_each(|s| walk.fetch(table, s));
+        walk
+    }
+
+    /// Goes on to the next tile: what belongs to it.
+    #[inline(always)]
+    fn advance(&mut self) -> Option<T> {
+        let current = self.waiting.take()?;
+        swap(&mut self.now, &mut self.next);
+        self.look();
+        Some(current)
+    }
+
+    /// Finds what is around the points of the tile behind all that were found.
+    #[inline(always)]
+    fn look(&mut self) {
+        if let Some((pos, waiting)) = self.tiles.next() {
+            self.lattice.find(pos, self.next);
+            self.waiting = Some(waiting);
+        }
+    }
+
+    /// Asks for the rows around the point of lane `s` of the next tile.
+    #[inline(always)]
+    fn fetch(&self, table: &[Row], s: usize) {
+        self.next.before.fetch(table, s);
+        if self.lattice.has_time() {
+            self.next.after.fetch(table, s);
+        }
     }
 }
 
@@ -158,20 +216,25 @@ impl Lattice {
         Self { scale, time_scale, last_cell, stride, rows, dense }
     }
 
-    /// Writes the features of `tiles` of points to `out`, a row a point; those that the last tile has too many are left out.
+    /// Writes the features of tiles of points, a row a point, to what belongs to each: of the lanes of a tile as many as that has rows.
     #[inline(always)]
-    pub fn encode(&self, table: &[Row], tiles: &[Points], out: &mut [Row], around: &mut Around) {
-        for (pos, out) in tiles.iter().zip(out.chunks_mut(TILE)) {
-            self.find(pos, around);
-            let Around { before, after, fraction } = &*around;
+    pub fn encode<'a>(
+        &self,
+        table: &[Row],
+        tiles: impl Iterator<Item = (&'a Points, &'a mut [Row])>,
+        around: &mut Around,
+    ) {
+        let mut walk = Walk::new(self, table, tiles, around);
+        while let Some(out) = walk.advance() {
+            let Walk { now, next, .. } = &walk;
             for (s, out) in out.iter_mut().enumerate() {
-                before.fetch(table, s + AHEAD);
-                *out = before.interpolate(table, s).0;
+                next.before.fetch(table, s);
+                *out = now.before.interpolate(table, s).0;
             }
             if self.has_time() {
                 for (s, out) in out.iter_mut().enumerate() {
-                    after.fetch(table, s + AHEAD);
-                    *out += (after.interpolate(table, s).0 - *out) * fraction[s];
+                    next.after.fetch(table, s);
+                    *out += (now.after.interpolate(table, s).0 - *out) * now.fraction[s];
                 }
             }
         }
@@ -179,23 +242,22 @@ impl Lattice {
 
     /// As [`Self::encode`], and each point's derivatives of its features by x, y and z.
     #[inline(always)]
-    pub fn encode_with_slopes(
+    pub fn encode_with_slopes<'a>(
         &self,
         table: &[Row],
-        tiles: &[Points],
-        out: &mut [Row],
-        slopes: &mut [[Row; 3]],
+        tiles: impl Iterator<Item = (&'a Points, (&'a mut [Row], &'a mut [Slopes]))>,
         around: &mut Around,
     ) {
-        for (pos, (out, slopes)) in tiles.iter().zip(out.chunks_mut(TILE).zip(slopes.chunks_mut(TILE))) {
-            self.find(pos, around);
+        let mut walk = Walk::new(self, table, tiles, around);
+        while let Some((out, slopes)) = walk.advance() {
+            let Cells { before, after, fraction } = &*walk.now;
             for (s, (out, slopes)) in out.iter_mut().zip(slopes).enumerate() {
-                let (mut value, mut by) = around.before.interpolate(table, s);
+                walk.fetch(table, s);
+                let (mut value, mut by) = before.interpolate(table, s);
                 if self.has_time() {
-                    let fraction = around.fraction[s];
-                    let (then, by_then) = around.after.interpolate(table, s);
-                    value += (then - value) * fraction;
-                    (0..3).for_each(|k| by[k] += (by_then[k] - by[k]) * fraction);
+                    let (then, by_then) = after.interpolate(table, s);
+                    value += (then - value) * fraction[s];
+                    (0..3).for_each(|k| by[k] += (by_then[k] - by[k]) * fraction[s]);
                 }
                 *out = value;
                 *slopes = std::array::from_fn(|k| by[k] * self.scale[k]);
@@ -210,8 +272,8 @@ impl Lattice {
 
     /// Finds what is around each point of a tile.
     #[inline(always)]
-    fn find(&self, pos: &Points, around: &mut Around) {
-        let Around { before, after, fraction } = around;
+    fn find(&self, pos: &Points, cells: &mut Cells) {
+        let Cells { before, after, fraction } = cells;
         if !self.has_time() {
             return self.corners(pos, &[0; TILE], before);
         }
@@ -281,39 +343,44 @@ impl Lattice {
         }
     }
 
-    /// Adds the gradients `g` of the features of `tiles` to the rows around their points, by the weights with which they were
-    /// read.
+    /// Adds the gradients of the features of tiles of points, which belong to each, to the rows around the points, by the weights with
+    /// which they were read.
     #[inline(always)]
-    pub fn scatter(&self, grads: &mut [Row], tiles: &[Points], g: &[Row], around: &mut Around) {
-        for (pos, g) in tiles.iter().zip(g.chunks(TILE)) {
-            self.find(pos, around);
-            let Around { before, after, fraction } = &*around;
+    pub fn scatter<'a>(
+        &self,
+        grads: &mut [Row],
+        tiles: impl Iterator<Item = (&'a Points, &'a [Row])>,
+        around: &mut Around,
+    ) {
+        let mut walk = Walk::new(self, grads, tiles, around);
+        while let Some(g) = walk.advance() {
+            let Walk { now: Cells { before, after, fraction }, next, .. } = &walk;
             if self.has_time() {
-                before.scatter(grads, g, |s| 1.0 - fraction[s]);
-                after.scatter(grads, g, |s| fraction[s]);
+                before.scatter(grads, g, |s| 1.0 - fraction[s], &next.before);
+                after.scatter(grads, g, |s| fraction[s], &next.after);
             } else {
-                before.scatter(grads, g, |_| 1.0);
+                before.scatter(grads, g, |_| 1.0, &next.before);
             }
         }
     }
 }
 
 impl Corners {
-    /// Asks for the rows around the point of lane `s`, if there is one, before they are needed.
+    /// Asks for the rows around the point of lane `s` before they are needed.
     #[inline(always)]
     fn fetch(&self, table: &[Row], s: usize) {
-        if let (true, Some(first)) = (s < TILE, table.first()) {
+        if let Some(first) = table.first() {
             for rows in &self.rows {
                 prefetch(first, rows[s] as usize * size_of::<Row>());
             }
         }
     }
 
-    /// Adds `g`, times `share` of its lane, to the rows by the weights with which they are read.
+    /// Adds `g`, times `share` of its lane, to the rows by the weights with which they are read, and asks for those of `next`.
     #[inline(always)]
-    fn scatter(&self, grads: &mut [Row], g: &[Row], share: impl Fn(usize) -> f32) {
+    fn scatter(&self, grads: &mut [Row], g: &[Row], share: impl Fn(usize) -> f32, next: &Self) {
         for (s, g) in g.iter().enumerate() {
-            self.fetch(grads, s + AHEAD);
+            next.fetch(grads, s);
             let g = *g * share(s);
             let (fx, fy, fz) = (self.frac[0][s], self.frac[1][s], self.frac[2][s]);
             let (g1, g0) = (g * fz, g * (1.0 - fz));
@@ -327,7 +394,7 @@ impl Corners {
 
     /// Features of lane `s`, and their derivatives by its three fractions.
     #[inline(always)]
-    fn interpolate(&self, table: &[Row], s: usize) -> (Row, [Row; 3]) {
+    fn interpolate(&self, table: &[Row], s: usize) -> (Row, Slopes) {
         let row = |n: usize| table[self.rows[n][s] as usize];
         let [fx, fy, fz] = [self.frac[0][s], self.frac[1][s], self.frac[2][s]];
         // By x along four edges, by y across two faces, by z through the cell.

@@ -1,6 +1,8 @@
 //! The encoding: what it is at lattice points and between them, and that its two gradients are its transpose and its
 //! derivative.
 
+use std::iter::once;
+
 use glam::Vec3;
 
 use super::hashgrid::{AXES, Around, HashGrid, Lattice, Points, Row, without_hashing};
@@ -39,7 +41,7 @@ fn tile(points: impl IntoIterator<Item = Vec3>) -> Tile {
 fn encode(grid: &HashGrid, tables: &[Vec<Row>], pos: &Tile) -> Vec<[Row; TILE]> {
     let encode = |(level, table): (&Lattice, &Vec<Row>)| {
         let mut out = [Row::ZERO; TILE];
-        level.encode(table, std::slice::from_ref(pos), &mut out, &mut Around::default());
+        level.encode(table, once((pos, &mut out[..])), &mut Around::default());
         out
     };
     grid.levels.iter().zip(tables).map(encode).collect()
@@ -109,6 +111,34 @@ fn all_levels_are_continuous_across_cells() {
 }
 
 #[test]
+fn tiles_after_one_another_are_as_each_of_them_alone() {
+    let (grid, tables) = grid(7);
+    let tiles: Vec<Tile> = (0..5).map(|n| tile(random_points(70 + n))).collect();
+    // The second and the last are not full.
+    let lanes = [TILE, 7, TILE, TILE, 1];
+    for (level, table) in grid.levels.iter().zip(&tables) {
+        let (mut rows, mut alone) = ([[Row::ZERO; TILE]; 5], [[Row::ZERO; TILE]; 5]);
+        let (mut flat, mut slopes) = ([[Row::ZERO; TILE]; 5], [[[Row::ZERO; 3]; TILE]; 5]);
+        let outs = rows.iter_mut().zip(lanes).map(|(rows, lanes)| &mut rows[..lanes]);
+        level.encode(table, tiles.iter().zip(outs), &mut Around::default());
+        let outs = flat.iter_mut().zip(lanes).map(|(rows, lanes)| &mut rows[..lanes]);
+        let outs = outs.zip(slopes.iter_mut().map(|slopes| &mut slopes[..]));
+        level.encode_with_slopes(table, tiles.iter().zip(outs), &mut Around::default());
+        let [mut sums, mut sums_alone] = [0; 2].map(|_| vec![Row::ZERO; level.rows]);
+        level.scatter(
+            &mut sums,
+            tiles.iter().zip(rows.iter().zip(lanes).map(|(g, lanes)| &g[..lanes])),
+            &mut Around::default(),
+        );
+        for ((tile, alone), lanes) in tiles.iter().zip(&mut alone).zip(lanes) {
+            level.encode(table, once((tile, &mut alone[..lanes])), &mut Around::default());
+            level.scatter(&mut sums_alone, once((tile, &alone[..lanes])), &mut Around::default());
+        }
+        assert_eq!((&rows, &flat, &sums), (&alone, &alone, &sums_alone));
+    }
+}
+
+#[test]
 fn scatter_is_the_transpose_of_encode() {
     let (grid, tables) = grid(4);
     let pos = tile(random_points(4));
@@ -117,7 +147,7 @@ fn scatter_is_the_transpose_of_encode() {
     for (level, l) in grid.levels.iter().enumerate() {
         let g: Vec<Row> = (0..TILE).map(|_| Row::splat(2.0 * rng.uniform() - 1.0)).collect();
         let mut scattered = vec![Row::ZERO; l.rows];
-        l.scatter(&mut scattered, &[pos], &g, &mut Around::default());
+        l.scatter(&mut scattered, once((&pos, &g[..])), &mut Around::default());
         let dot = |a: Row, b: Row| f64::from(a.dot(b));
         let left: f64 = (0..TILE).map(|n| dot(encoded[level][n], g[n])).sum();
         let right: f64 = scattered.iter().zip(&tables[level]).map(|(a, b)| dot(*a, *b)).sum();
@@ -135,16 +165,12 @@ fn slopes_are_the_derivatives() {
     // In the middle of a cell, so that the difference stays inside it, where the encoding is linear along each axis.
     let middle = |p: Vec3| ((p * 40.0).floor() + 0.5) / 40.0;
     let points: Vec<Vec3> = random_points(5).into_iter().map(middle).collect();
+    let pos = tile(points.clone());
     for (n, (level, table)) in grid.levels.iter().zip(&tables).enumerate() {
         let (mut rows, mut slopes) = ([Row::ZERO; TILE], [[Row::ZERO; 3]; TILE]);
-        level.encode_with_slopes(
-            table,
-            &[tile(points.clone())],
-            &mut rows,
-            &mut slopes,
-            &mut Around::default(),
-        );
-        assert_eq!(rows, encode(&grid, &tables, &tile(points.clone()))[n]);
+        let tiles = once((&pos, (&mut rows[..], &mut slopes[..])));
+        level.encode_with_slopes(table, tiles, &mut Around::default());
+        assert_eq!(rows, encode(&grid, &tables, &pos)[n]);
         for axis in 0..3 {
             let mut h = Vec3::ZERO;
             h[axis] = 1.0 / 256.0;
@@ -174,16 +200,13 @@ fn points_outside_the_box_or_not_finite_are_harmless() {
         }
     }
     for level in &grid.levels {
-        level.scatter(&mut vec![Row::ZERO; level.rows], &[pos], &[Row::ONE; TILE], &mut Around::default());
+        let tiles = once((&pos, &[Row::ONE; TILE][..]));
+        level.scatter(&mut vec![Row::ZERO; level.rows], tiles, &mut Around::default());
     }
     for (level, table) in grid.levels.iter().zip(&tables) {
-        level.encode_with_slopes(
-            table,
-            &[pos],
-            &mut [Row::ZERO; TILE],
-            &mut [[Row::ZERO; 3]; TILE],
-            &mut Around::default(),
-        );
+        let (mut rows, mut slopes) = ([Row::ZERO; TILE], [[Row::ZERO; 3]; TILE]);
+        let tiles = once((&pos, (&mut rows[..], &mut slopes[..])));
+        level.encode_with_slopes(table, tiles, &mut Around::default());
     }
     let clamped = encode(&grid, &tables, &tile([EXTENT, Vec3::ZERO]));
     let outside = encode(&grid, &tables, &tile([EXTENT * 3.0, -EXTENT]));

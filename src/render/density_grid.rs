@@ -2,7 +2,7 @@
 
 use glam::{UVec3, Vec3};
 
-use crate::simd::floor_within;
+use crate::simd::{floor_within, prefetch};
 
 /// Points that are looked up together.
 pub const STRIDE: usize = 16;
@@ -72,17 +72,22 @@ impl DensityGrid {
         index
     }
 
-    /// Adds the σ of the cells that hold `points` (x, y, z rows) to `out`.
+    /// Asks for `cells` before they are needed.
     #[inline(always)]
-    pub fn add_at(&self, points: &[[f32; STRIDE]; 3], slices: &[u32; STRIDE], out: &mut [f32; STRIDE]) {
-        let indices = self.indices(points, slices);
+    pub fn fetch(&self, cells: &[u32]) {
+        for cell in cells {
+            prefetch(&self.sigma[0], *cell as usize * size_of::<f32>());
+        }
+    }
+
+    /// σ of `cells`.
+    #[inline(always)]
+    pub fn of(&self, cells: &[u32; STRIDE]) -> [f32; STRIDE] {
         let mut sigma = [0.0; STRIDE];
         for n in 0..STRIDE {
-            sigma[n] = self.sigma[indices[n] as usize];
+            sigma[n] = self.sigma[cells[n] as usize];
         }
-        for n in 0..STRIDE {
-            out[n] += sigma[n];
-        }
+        sigma
     }
 
     /// σ of the cell that holds `p`.

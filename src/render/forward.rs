@@ -158,22 +158,47 @@ impl RayGrids<'_> {
     }
 }
 
+/// Cells of the three grids, a lane each.
+#[derive(Clone, Copy, Default)]
+struct RayCells {
+    cells: [[u32; STRIDE]; 3],
+    /// Where the actor can be.
+    near: [bool; STRIDE],
+}
+
 impl Steer for RayGrids<'_> {
+    type Cells = RayCells;
+
     #[inline(always)]
-    fn sigma(&self, points: &[Lanes; 3], t: &Lanes) -> [Lanes; 2] {
-        let Self { model, slices, .. } = self;
-        let [persistent, dynamic, actor] = &model.grids.streams;
+    fn find(&self, points: &[Lanes; 3], t: &Lanes) -> RayCells {
+        let Self { model: Model { grids, streams, .. }, slices, .. } = self;
+        let mut found = RayCells::default();
+        for s in (0..2).filter(|s| streams[*s]) {
+            found.cells[s] = grids.streams[s].indices(points, &slices[s]);
+            grids.streams[s].fetch(&found.cells[s]);
+        }
+        if streams[2] {
+            found.near = self.near(t);
+            if found.near != [false; STRIDE] {
+                found.cells[2] = grids.streams[2].indices(&self.actor_points(t), &slices[2]);
+                grids.streams[2].fetch(&found.cells[2]);
+            }
+        }
+        found
+    }
+
+    #[inline(always)]
+    fn sigma(&self, RayCells { cells, near }: &RayCells) -> [Lanes; 2] {
+        let Model { grids: Grids { streams: grids, .. }, streams, .. } = self.model;
         let [mut stands, mut moves] = [[0.0; STRIDE]; 2];
-        if model.streams[0] {
-            persistent.add_at(points, &slices[0], &mut stands);
+        if streams[0] {
+            stands = grids[0].of(&cells[0]);
         }
-        if model.streams[1] {
-            dynamic.add_at(points, &slices[1], &mut moves);
+        if streams[1] {
+            moves = grids[1].of(&cells[1]);
         }
-        let near = self.near(t);
-        if model.streams[2] && near != [false; STRIDE] {
-            let mut sigma = [0.0; STRIDE];
-            actor.add_at(&self.actor_points(t), &slices[2], &mut sigma);
+        if *near != [false; STRIDE] {
+            let sigma = grids[2].of(&cells[2]);
             for n in 0..STRIDE {
                 moves[n] += if near[n] { sigma[n] } else { 0.0 };
             }
@@ -495,12 +520,18 @@ impl Chunk {
     ) {
         let (grid, threshold) = (&grids.model.grids.streams[s], grids.model.grids.threshold[s]);
         let cells = grid.indices(points, &grids.slices[s]);
+        let sigma = grid.of(&cells);
+        // Bits, since which lanes are taken is nothing that a processor could foresee one by one.
+        let mut taken = 0u32;
         for n in 0..STRIDE {
-            if lanes[n] && grid.sigma[cells[n] as usize] >= threshold {
-                let p = Vec3::from_array([0, 1, 2].map(|axis| points[axis][n]));
-                self.batches[s].push(number + n, ray + n, p, times[n]);
-                self.cells[s].push(Placed { sample: (number + n) as u32, cell: cells[n] });
-            }
+            taken |= u32::from(lanes[n] & (sigma[n] >= threshold)) << n;
+        }
+        while taken != 0 {
+            let n = taken.trailing_zeros() as usize;
+            taken &= taken - 1;
+            let p = Vec3::from_array([0, 1, 2].map(|axis| points[axis][n]));
+            self.batches[s].push(number + n, ray + n, p, times[n]);
+            self.cells[s].push(Placed { sample: (number + n) as u32, cell: cells[n] });
         }
     }
 }

@@ -13,6 +13,9 @@ const MAX_STEPS: usize = 768;
 /// Steps after which is looked whether any ray goes on.
 const LOOK_EVERY: usize = 4;
 
+/// Steps from one whose cells are looked up to the one whose cells are asked for.
+const AHEAD: usize = 4;
+
 /// See [`Sampler`]: a share of the light that does not show.
 const SATURATED: f32 = 1e-4;
 
@@ -40,8 +43,14 @@ pub type Lanes = [f32; STRIDE];
 ///
 /// A trait and not a closure, which would not be inlined, and so compiled without the caller's vector features.
 pub trait Steer {
-    /// σ of what stands and of what moves, at a point of each ray (x, y, z rows) and its distance.
-    fn sigma(&self, points: &[Lanes; 3], t: &Lanes) -> [Lanes; 2];
+    /// Where to look it up.
+    type Cells: Copy + Default;
+
+    /// Finds the cells of a point of each ray (x, y, z rows) at its distance, and asks for them before they are needed.
+    fn find(&self, points: &[Lanes; 3], t: &Lanes) -> Self::Cells;
+
+    /// σ of what stands and of what moves in them.
+    fn sigma(&self, cells: &Self::Cells) -> [Lanes; 2];
 }
 
 /// Rays that are sampled together, a lane each; those that miss the box, and lanes that are none, are of length 0.
@@ -146,7 +155,7 @@ impl Sampler {
 
     /// Finds the weights of all steps.
     #[inline(always)]
-    fn walk(&mut self, rays: &RayLanes, sampling: &Sampling, steer: &impl Steer) -> Walked {
+    fn walk<S: Steer>(&mut self, rays: &RayLanes, sampling: &Sampling, steer: &S) -> Walked {
         let [mut steps, mut dt, mut scale] = [[0.0; STRIDE]; 3];
         let mut most = 0.0f32;
         for n in (0..STRIDE).filter(|n| rays.hits(*n)) {
@@ -158,13 +167,15 @@ impl Sampler {
         let [mut left, mut past] = [[1.0; STRIDE]; 2];
         let [mut total, mut used] = [[0.0; STRIDE]; 2];
         let mut walked = 0;
+        let mut ahead = [S::Cells::default(); AHEAD];
+        for (step, cells) in ahead.iter_mut().enumerate() {
+            *cells = cells_at(rays, &dt, step, steer);
+        }
         for (step, weights) in self.weights.iter_mut().take(most as usize).enumerate() {
             let at = step as f32;
-            let mut t = [0.0; STRIDE];
-            for n in 0..STRIDE {
-                t[n] = rays.start[n] + (at + 0.5) * dt[n];
-            }
-            let [stands, moves] = steer.sigma(&rays.points(&t), &t);
+            let cells = &mut ahead[step % AHEAD];
+            let [stands, moves] = steer.sigma(cells);
+            *cells = cells_at(rays, &dt, step + AHEAD, steer);
             let [mut weight, mut goes_on] = [[0.0; STRIDE]; 2];
             for n in 0..STRIDE {
                 // The step after which nothing is left is the last.
@@ -252,6 +263,16 @@ impl Sampler {
         }
         edges[count] = edge;
     }
+}
+
+/// The cells that rays pass in the middle of step `step`, of which each has its own length.
+#[inline(always)]
+fn cells_at<S: Steer>(rays: &RayLanes, dt: &Lanes, step: usize, steer: &S) -> S::Cells {
+    let mut t = [0.0; STRIDE];
+    for n in 0..STRIDE {
+        t[n] = rays.start[n] + (step as f32 + 0.5) * dt[n];
+    }
+    steer.find(&rays.points(&t), &t)
 }
 
 /// e^-tau to first order, and cheaper; only steers the samples.

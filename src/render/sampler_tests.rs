@@ -17,7 +17,13 @@ fn ray(start: f32, end: f32) -> Ray {
 struct Along<F>(F);
 
 impl<F: Fn(f32) -> f32> Steer for Along<F> {
-    fn sigma(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
+    type Cells = [f32; STRIDE];
+
+    fn find(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
+        *t
+    }
+
+    fn sigma(&self, t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
         [t.map(&self.0), [0.0; STRIDE]]
     }
 }
@@ -107,7 +113,13 @@ fn a_ray_that_misses_the_box_places_nothing() {
 struct Two<F, G>(F, G);
 
 impl<F: Fn(f32) -> f32, G: Fn(f32) -> f32> Steer for Two<F, G> {
-    fn sigma(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
+    type Cells = [f32; STRIDE];
+
+    fn find(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
+        *t
+    }
+
+    fn sigma(&self, t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
         [t.map(&self.0), t.map(&self.1)]
     }
 }

@@ -11,8 +11,7 @@ mod machine;
 pub mod matrix;
 
 pub use machine::{
-    Finish, Product, add_quarter_sums, columns, fours_of_rows, multiply, prefetch, prefetch_rows,
-    rows_of_fours,
+    Finish, Product, add_sums, columns, fours_of_rows, multiply, prefetch, prefetch_rows, rows_of_fours,
 };
 
 use bytemuck::{Pod, Zeroable};

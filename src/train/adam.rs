@@ -4,6 +4,7 @@ use pulp::{Scalar, Simd};
 
 use crate::field::hashgrid::{FEATURES, Row};
 use crate::simd::floats::{ColumnMut, Floats};
+use crate::simd::prefetch;
 
 /// Decay rates and the guard against division by zero; instant-ngp's values.
 const BETA1: f32 = 0.9;
@@ -80,22 +81,28 @@ impl TableState {
         gradient: &mut [Row],
         step: StepSize,
     ) -> usize {
-        let [w, g, m, v] =
-            [table, gradient, &mut self.first, &mut self.second].map(bytemuck::cast_slice_mut::<Row, f32>);
-        let (mut at, mut updated) = (0, 0);
-        while at < g.len() {
-            let start = at;
-            while at < g.len() && has_gradient(&g[at..]) {
-                at += LINE;
+        let columns = [table, gradient, &mut self.first, &mut self.second];
+        let [w, g, m, v] = columns.map(bytemuck::cast_slice_mut::<Row, f32>);
+        let (mut seen, mut updated) = (0u32, 0);
+        // Lines that are far apart are none that the processor foresees.
+        for ahead in 0..g.len().div_ceil(LINE) + AHEAD {
+            seen <<= 1;
+            if has_gradient(&g[g.len().min(ahead * LINE)..]) {
+                seen |= 1;
+                for column in [&*w, &*m, &*v] {
+                    prefetch(&column[ahead * LINE], 0);
+                }
             }
-            let end = at.min(g.len());
-            if start < end {
-                let run = start..end;
-                let seen = [&mut w[run.clone()], &mut g[run.clone()], &mut m[run.clone()], &mut v[run]];
-                update_seen(simd, seen, step);
-                updated += end - start;
+            if seen & 1 << AHEAD != 0 {
+                let line = (ahead - AHEAD) * LINE..g.len().min((ahead - AHEAD + 1) * LINE);
+                updated += line.len();
+                let [w, g, m, v] = [&mut *w, &mut *g, &mut *m, &mut *v];
+                update_seen(
+                    simd,
+                    [&mut w[line.clone()], &mut g[line.clone()], &mut m[line.clone()], &mut v[line]],
+                    step,
+                );
             }
-            at += LINE;
         }
         updated / FEATURES
     }
@@ -104,10 +111,13 @@ impl TableState {
 /// Numbers of a cache line.
 const LINE: usize = 16;
 
+/// Lines from one that is updated to the one that is asked for.
+const AHEAD: usize = 12;
+
 /// Whether one of the first numbers, as many as a cache line holds, is not zero.
 #[inline(always)]
 fn has_gradient(gradient: &[f32]) -> bool {
-    let Some(line) = gradient.first_chunk::<LINE>() else { return true };
+    let Some(line) = gradient.first_chunk::<LINE>() else { return !gradient.is_empty() };
     line.iter().fold(false, |any, g| any | (*g != 0.0))
 }
 

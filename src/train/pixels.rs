@@ -11,6 +11,7 @@ use crate::render::rays::{PixelDirections, View, pixel_directions};
 use crate::render::refined::refined_camera;
 use crate::rng::Rng;
 use crate::scene::{Camera, Frame, SceneError};
+use crate::simd::prefetch;
 use crate::stereo::{self, SeenFrame, StereoConfig, StereoDepth, StereoFrame};
 
 /// Frames with their pixels and the directions of their cameras' pixels.
@@ -23,8 +24,8 @@ pub struct PixelSet {
     pub stereo: Vec<StereoDepth>,
     /// Where things are that move; nothing before that was looked for.
     pub moving: Volume,
-    /// Indices of usable pixels where a frame has a mask.
-    usable: Vec<Option<Vec<u32>>>,
+    /// Which pixels are usable where a frame has a mask.
+    usable: Vec<Option<Vec<bool>>>,
     /// Where rays go.
     novelty: Novelty,
     /// Half-way to the frames before and after each frame.
@@ -42,12 +43,7 @@ impl PixelSet {
     pub fn load(frames: Vec<Frame>, size: f64, novelty: f64) -> Result<Self, SceneError> {
         let loaded: Vec<_> = frames
             .par_iter()
-            .map(|f| {
-                let usable = f.load_mask()?.map(|mask| {
-                    mask.iter().enumerate().filter(|(_, m)| **m).map(|(n, _)| n as u32).collect::<Vec<_>>()
-                });
-                Ok((f.load_rgb()?.pixels, usable))
-            })
+            .map(|f| Ok((f.load_rgb()?.pixels, f.load_mask()?)))
             .collect::<Result<_, SceneError>>()?;
         let (images, usable) = loaded.into_iter().unzip();
         let mut cameras: Vec<(Camera, PixelDirections)> = Vec::new();
@@ -68,6 +64,12 @@ impl PixelSet {
     /// Directions of all pixels of frame `n` in camera axes.
     pub fn directions(&self, n: usize) -> &[glam::Vec3] {
         &self.cameras[self.camera_of[n]].1
+    }
+
+    /// Asks for what [`Self::directions`] and images say about a pixel of frame `n` before it is needed.
+    pub fn fetch(&self, n: usize, pixel: usize) {
+        prefetch(&self.images[n][pixel], 0);
+        prefetch(&self.directions(n)[pixel], 0);
     }
 
     /// A time near that of frame `n`: from half-way to the frame before it (`u` = 0) to half-way to the one after it
@@ -158,12 +160,12 @@ impl PixelSet {
 
     /// Whether the mask of frame `n` leaves pixel number `pixel`.
     pub fn is_usable(&self, n: usize, pixel: u32) -> bool {
-        self.usable[n].as_ref().is_none_or(|list| list.binary_search(&pixel).is_ok())
+        self.usable[n].as_ref().is_none_or(|mask| mask[pixel as usize])
     }
 
     /// Whether any frame has a usable pixel.
     pub fn has_usable(&self) -> bool {
-        self.usable.iter().any(|list| list.as_ref().is_none_or(|list| !list.is_empty()))
+        self.usable.iter().any(|mask| mask.as_ref().is_none_or(|mask| mask.contains(&true)))
     }
 
     /// Number of a frame and a usable pixel of it. There must be one.

@@ -40,9 +40,9 @@ mod update;
 /// the same order on any machine.
 const GROUPS: usize = 16;
 
-/// Rays whose activations are kept together: of 64 × 20 samples some two thirds are not faint, 1.5 MB, within one core's
-/// L2. More of them share the sums at the end of a chunk, and fill the tiles of streams that are evaluated here and there.
-pub const CHUNK_RAYS: usize = 64;
+/// Rays whose activations are kept together: of 128 × 20 samples some two thirds are not faint, 3 MB. Fewer would fit one core's L2, but
+/// more fill the tiles of streams that are evaluated here and there, and that is worth more.
+pub const CHUNK_RAYS: usize = 128;
 
 /// Random numbers from here down are those of the frames' times.
 const TIMES: u64 = u64::MAX / 2;
@@ -238,19 +238,20 @@ impl Optimiser {
 
 /// Encodes the samples of all groups, one level after the other.
 fn encode(groups: &mut [Group], model: &Model) {
-    let mut levels: [Vec<Vec<LevelTask>>; 3] = Default::default();
+    let mut levels: [Vec<LevelTask>; 3] = Default::default();
     for (s, batch) in groups.iter_mut().flat_map(Group::batches) {
         let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
-        levels[s].resize_with(net.encoding.levels.len(), Vec::new);
-        for (level, task) in levels[s].iter_mut().zip(batch.tasks(&net.encoding, w.tables)) {
-            level.push(task);
+        let of_batch = batch.tasks(&net.encoding, w.tables);
+        if levels[s].is_empty() {
+            levels[s] = of_batch;
+        } else {
+            levels[s].iter_mut().zip(of_batch).for_each(|(task, of_batch)| task.append(of_batch));
         }
     }
     let arch = pulp::Arch::new();
     let mut tasks = Tasks::default();
     for level in levels.into_iter().flatten() {
-        let cost = level.iter().map(LevelTask::cost).sum();
-        tasks.add(cost, move || arch.dispatch(EncodePass(level)));
+        tasks.add(level.cost(), move || arch.dispatch(EncodePass(level)));
     }
     tasks.run();
 }
@@ -272,17 +273,14 @@ impl WithSimd for PlacePass<'_> {
     }
 }
 
-struct EncodePass<'a>(Vec<LevelTask<'a>>);
+struct EncodePass<'a>(LevelTask<'a>);
 
 impl WithSimd for EncodePass<'_> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
-        let mut around = Around::default();
-        for task in self.0 {
-            task.run(&mut around);
-        }
+        self.0.run(&mut Around::default());
     }
 }
 

@@ -53,9 +53,8 @@ impl<'a, B: Iterator<Item = &'a StreamBatch>> WithSimd for TablePass<'_, B> {
             gradient.resize(table.len(), Row::ZERO);
         }
         let gradient = &mut gradient[..table.len()];
-        for batch in batches.filter(|b| !b.is_empty()) {
-            level.scatter(gradient, batch.tiles(), &batch.levels[number].rows[..batch.len()], around);
-        }
+        let tiles = batches.filter(|b| !b.is_empty()).flat_map(|b| b.encoded(number));
+        level.scatter(gradient, tiles, around);
         state.update(simd, table, gradient, rate)
     }
 }

@@ -12,7 +12,13 @@ use crate::rng::Rng;
 struct Stretches(Vec<f32>);
 
 impl Steer for Stretches {
-    fn sigma(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
+    type Cells = [f32; STRIDE];
+
+    fn find(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
+        *t
+    }
+
+    fn sigma(&self, t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
         let stretch = |t: f32| (t * self.0.len() as f32) as usize % self.0.len();
         [t.map(|t| self.0[stretch(t)]), t.map(|t| self.0[self.0.len() - 1 - stretch(t)])]
     }

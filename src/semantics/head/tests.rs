@@ -135,7 +135,7 @@ fn evaluate(heads: &Heads, s: usize, p: Vec3, time: f32, size: f32) -> Vec<f64> 
     let mut x: Vec<f64> = Vec::new();
     for (level, table) in net.grid.levels.iter().zip(&heads.tables[s]) {
         let mut rows = [Row::ZERO; 1];
-        level.encode(table, &[points], &mut rows, &mut Around::default());
+        level.encode(table, std::iter::once((&points, &mut rows[..])), &mut Around::default());
         x.extend(rows[0].to_array().map(f64::from));
     }
     if let Some([low, high]) = heads.shape.scales {
@@ -174,9 +174,9 @@ fn gradients(heads: &Heads, sources: &Sources, targets: &RayTargets) -> Gradient
     let tables = std::array::from_fn(|s| {
         let batch = group.batch(s);
         let levels = &heads.nets[s].as_ref().unwrap().grid.levels;
-        let scattered = levels.iter().zip(&batch.levels).map(|(level, rows)| {
+        let scattered = levels.iter().enumerate().map(|(n, level)| {
             let mut grads = vec![Row::ZERO; level.rows()];
-            level.scatter(&mut grads, batch.tiles(), &rows.rows[..batch.len()], &mut Around::default());
+            level.scatter(&mut grads, batch.encoded(n), &mut Around::default());
             grads
         });
         scattered.collect()

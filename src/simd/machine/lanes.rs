@@ -114,18 +114,20 @@ pub fn keep_eights(values: &mut [f32], layout: Layout, kept: &[u32], first: usiz
     }
 }
 
-/// As [`super::add_quarter_sums`] of sixteen: a quarter of a register has a part of four rows.
-#[target_feature(enable = "avx512f")]
-pub fn add_quarter_sums(rows: &[f32], out: &mut [[f32; LANES]]) {
+/// As [`super::add_sums`] of sixteen: first a quarter of a register has a part of the sums of four rows.
+#[target_feature(enable = "avx512f,avx512dq")]
+pub fn add_sums(rows: &[f32], out: &mut [[f32; 4]]) {
     for (out, [a, b, c, d]) in out.iter_mut().zip(rows.as_chunks::<LANES>().0.as_chunks::<4>().0) {
         let a = _mm512_castps_pd(add_halves(load(a), load(b)));
         let b = _mm512_castps_pd(add_halves(load(c), load(d)));
-        let sums = _mm512_add_ps(
+        let quarters = _mm512_add_ps(
             _mm512_castpd_ps(_mm512_unpacklo_pd(a, b)),
             _mm512_castpd_ps(_mm512_unpackhi_pd(a, b)),
         );
-        // SAFETY: as many floats as are written.
-        unsafe { _mm512_storeu_ps(out.as_mut_ptr(), _mm512_add_ps(load(out), sums)) };
+        let halves = _mm256_add_ps(_mm512_castps512_ps256(quarters), _mm512_extractf32x8_ps::<1>(quarters));
+        let sums = _mm_add_ps(_mm256_castps256_ps128(halves), _mm256_extractf128_ps::<1>(halves));
+        // SAFETY: as many floats as are read and written.
+        unsafe { _mm_storeu_ps(out.as_mut_ptr(), _mm_add_ps(_mm_loadu_ps(out.as_ptr()), sums)) };
     }
 }
 

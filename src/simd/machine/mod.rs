@@ -42,14 +42,13 @@ pub fn prefetch_rows<T>(rows: &[T], at: usize, stride: usize) {
     }
 }
 
-/// Adds the sum of each of four rows of `lanes` numbers to every fourth number of `out`, and so on for the next four: how it is
-/// divided among them depends on the machine.
+/// Adds the sum of each of four rows of `lanes` numbers to a number of `out`, and so on for the next four.
 #[inline(always)]
-pub fn add_quarter_sums(rows: &[f32], lanes: usize, out: &mut [[f32; 16]]) {
+pub fn add_sums(rows: &[f32], lanes: usize, out: &mut [[f32; 4]]) {
     #[cfg(target_arch = "x86_64")]
-    if lanes == 16 && is_x86_feature_detected!("avx512f") {
+    if lanes == 16 && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") {
         // SAFETY: this processor has the instructions.
-        return unsafe { lanes::add_quarter_sums(rows, out) };
+        return unsafe { lanes::add_sums(rows, out) };
     }
     for (out, rows) in out.iter_mut().zip(rows.chunks_exact(4 * lanes)) {
         out.iter_mut().zip(rows.chunks_exact(lanes)).for_each(|(out, row)| *out += row.iter().sum::<f32>());

@@ -3,11 +3,11 @@
 use bytemuck::cast_slice_mut;
 
 use super::super::{BLOCK, Layer};
-use super::by_samples::{Partial, parts};
+use super::by_samples::{Block, parts};
 use super::{Strip, inputs_together};
 use crate::simd::dots::{LANES, outer_product, pair, pair_samples, pairs_of};
 use crate::simd::matrix::Pairs;
-use crate::simd::{AlignedVec, add_quarter_sums};
+use crate::simd::{AlignedVec, add_sums};
 
 /// Adds the parameter gradients of a strip to `sums`, in the order of [`super::by_samples::accumulate`]. Pairs of samples are made in
 /// `panel`.
@@ -49,7 +49,7 @@ pub fn accumulate(layers: &[Layer], strip: Strip<Pairs>, sums: &mut [f32], panel
 }
 
 #[inline(always)]
-fn add_product<const INPUTS: usize>(dy: &[Pairs], x: &[Pairs], stride: usize, out: &mut [Partial]) {
+fn add_product<const INPUTS: usize>(dy: &[Pairs], x: &[Pairs], stride: usize, out: &mut [Block]) {
     let sums = outer_product::<INPUTS>(dy, x, stride);
-    add_quarter_sums(sums.as_flattened().as_flattened(), LANES, out);
+    add_sums(sums.as_flattened().as_flattened(), LANES, out);
 }

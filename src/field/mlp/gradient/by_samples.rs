@@ -1,21 +1,20 @@
-//! Sums over vectors of samples, as tiles hold them; of each, four numbers a parameter are kept until the end.
+//! Sums over vectors of samples, as tiles hold them.
 
-use glam::Vec4;
 use pulp::Simd;
 
 use super::super::{BLOCK, Layer};
 use super::{Strip, TileView, inputs_together};
-use crate::simd::{TILE, add_quarter_sums};
+use crate::simd::{TILE, add_sums};
 
-/// Four numbers each of four parameters' gradient, which are yet to be summed: number `n` of all sixteen is of parameter `n % 4`.
-pub type Partial = [f32; BLOCK * BLOCK];
+/// The gradients of the weights of four outputs for one input, or of their biases.
+pub type Block = [f32; BLOCK];
 
 /// Numbers that are summed.
 pub fn len(layers: &[Layer]) -> usize {
-    layers.iter().map(|l| BLOCK * (l.weights() + l.n_out)).sum()
+    layers.iter().map(|l| l.weights() + l.n_out).sum()
 }
 
-/// Adds the parameter gradients of a strip to `sums`, four numbers a parameter.
+/// Adds the parameter gradients of a strip to `sums`.
 ///
 /// Layer by layer, of four outputs after the other the weights input by input, then the biases.
 #[inline(always)]
@@ -47,7 +46,7 @@ pub fn accumulate<S: Simd>(simd: S, layers: &[Layer], strip: Strip, sums: &mut [
 
 /// Those of all sums that are of a layer's weights, and of its biases.
 #[inline(always)]
-pub fn parts<'a>(sums: &'a mut [f32], layer: &Layer) -> (&'a mut [Partial], &'a mut [Partial]) {
+pub fn parts<'a>(sums: &'a mut [f32], layer: &Layer) -> (&'a mut [Block], &'a mut [Block]) {
     let (weights, biases) =
         sums.as_chunks_mut().0[layer.param / BLOCK..].split_at_mut(layer.weights() / BLOCK);
     (weights, &mut biases[..layer.n_out / BLOCK])
@@ -55,25 +54,20 @@ pub fn parts<'a>(sums: &'a mut [f32], layer: &Layer) -> (&'a mut [Partial], &'a 
 
 /// Adds `sums` to `out`, in the order of the parameters.
 pub fn unpack(layers: &[Layer], sums: &[f32], out: &mut [f32]) {
-    let (sums, _) = sums.as_chunks();
+    let (sums, _) = sums.as_chunks::<BLOCK>();
     for layer in layers {
         let (weights, biases) = sums[layer.param / BLOCK..].split_at(layer.weights() / BLOCK);
         let (gw, gb) = out[layer.param..].split_at_mut(layer.weights());
         let rows = gw.chunks_exact_mut(BLOCK * layer.n_in).zip(gb.chunks_exact_mut(BLOCK));
         for ((gw, gb), (weights, bias)) in rows.zip(weights.chunks_exact(layer.n_in).zip(biases)) {
-            for (i, partial) in weights.iter().enumerate() {
-                for (j, sum) in summed(partial).into_iter().enumerate() {
+            for (i, block) in weights.iter().enumerate() {
+                for (j, sum) in block.iter().enumerate() {
                     gw[j * layer.n_in + i] += sum;
                 }
             }
-            gb.iter_mut().zip(summed(bias)).for_each(|(g, sum)| *g += sum);
+            gb.iter_mut().zip(bias).for_each(|(g, sum)| *g += sum);
         }
     }
-}
-
-fn summed(partial: &Partial) -> [f32; BLOCK] {
-    let [a, b, c, d] = [0, 1, 2, 3].map(|n| Vec4::from_slice(&partial[n * BLOCK..]));
-    ((a + b) + (c + d)).to_array()
 }
 
 /// Adds Σ over samples of dy[j] x[k] to `out`, for four outputs and `WIDE` inputs: for half of the outputs at a time where registers
@@ -84,7 +78,7 @@ fn outer_product<S: Simd, const WIDE: usize>(
     dy: TileView,
     x: TileView,
     count: usize,
-    out: &mut [Partial],
+    out: &mut [Block],
 ) {
     let mut sums = [[simd.splat_f32s(0.0); BLOCK]; WIDE];
     if S::REGISTER_COUNT < 32 {
@@ -93,7 +87,7 @@ fn outer_product<S: Simd, const WIDE: usize>(
     } else {
         outputs_by_inputs::<S, BLOCK, WIDE>(simd, dy, x, count, 0, &mut sums);
     }
-    add_sums::<S, _>(&sums, out);
+    add_vectors::<S, _>(&sums, out);
 }
 
 /// Σ over samples of dy[j] x[k], but for the sum over lanes, as `out[k][first + j]`.
@@ -134,7 +128,7 @@ fn outputs_by_inputs<S: Simd, const OUTPUTS: usize, const INPUTS: usize>(
 
 /// Adds Σ over samples of dy[j] to `out`.
 #[inline(always)]
-fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Partial) {
+fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Block) {
     let vectors = TILE / S::F32_LANES;
     // Sums of their own for every third vector, so that none waits for the one before it.
     let mut acc = [[simd.splat_f32s(0.0); BLOCK]; 3];
@@ -149,11 +143,11 @@ fn bias_gradient<S: Simd>(simd: S, dy: TileView, count: usize, out: &mut Partial
     for j in 0..BLOCK {
         acc[0][j] = simd.add_f32s(acc[0][j], simd.add_f32s(acc[1][j], acc[2][j]));
     }
-    add_sums::<S, _>(&[acc[0]], std::slice::from_mut(out));
+    add_vectors::<S, _>(&[acc[0]], std::slice::from_mut(out));
 }
 
-/// Adds the lanes of four vectors each to `out`, as far as they are summed there.
+/// Adds the sums over the lanes of four vectors each to `out`.
 #[inline(always)]
-fn add_sums<S: Simd, const N: usize>(vectors: &[[S::f32s; BLOCK]; N], out: &mut [Partial]) {
-    add_quarter_sums(bytemuck::cast_slice(vectors.as_flattened()), S::F32_LANES, out);
+fn add_vectors<S: Simd, const N: usize>(vectors: &[[S::f32s; BLOCK]; N], out: &mut [Block]) {
+    add_sums(bytemuck::cast_slice(vectors.as_flattened()), S::F32_LANES, out);
 }

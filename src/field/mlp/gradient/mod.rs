@@ -23,12 +23,9 @@ pub fn strip<S: Simd>(rounded: bool) -> usize {
     } else if is_like_avx2::<S>() {
         // Sums have no end, so that the nearest cache may decide.
         2
-    } else if S::REGISTER_COUNT < 32 {
-        // Six inputs and four outputs of as many tiles fit a nearest cache of 32 KiB, which processors with few registers have, or
-        // one of 48 KiB.
-        9
     } else {
-        18
+        // Six inputs and four outputs of as many tiles fit a nearest cache of 32 KiB.
+        9
     }
 }
 
