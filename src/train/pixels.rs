@@ -11,7 +11,6 @@ use crate::render::rays::{PixelDirections, View, pixel_directions};
 use crate::render::refined::refined_camera;
 use crate::rng::Rng;
 use crate::scene::{Camera, Frame, SceneError};
-use crate::simd::prefetch;
 use crate::stereo::{self, SeenFrame, StereoConfig, StereoDepth, StereoFrame};
 
 /// Frames with their pixels and the directions of their cameras' pixels.
@@ -64,12 +63,6 @@ impl PixelSet {
     /// Directions of all pixels of frame `n` in camera axes.
     pub fn directions(&self, n: usize) -> &[glam::Vec3] {
         &self.cameras[self.camera_of[n]].1
-    }
-
-    /// Asks for what [`Self::directions`] and images say about a pixel of frame `n` before it is needed.
-    pub fn fetch(&self, n: usize, pixel: usize) {
-        prefetch(&self.images[n][pixel], 0);
-        prefetch(&self.directions(n)[pixel], 0);
     }
 
     /// A time near that of frame `n`: from half-way to the frame before it (`u` = 0) to half-way to the one after it
