@@ -96,7 +96,9 @@ impl<'a, 'p, T, I: Iterator<Item = (&'p Points, T)>> Walk<'a, I, T> {
         let Around([now, next]) = around;
         let mut walk = Self { lattice, tiles, now, next, waiting: None };
         walk.look();
-        (0..TILE).for_each(|s| walk.fetch(table, s));
+        if walk.waiting.is_some() {
+            (0..TILE).for_each(|s| walk.fetch(table, s));
+        }
         walk
     }
 

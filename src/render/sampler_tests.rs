@@ -4,7 +4,7 @@ use glam::Vec3;
 
 use super::density_grid::STRIDE;
 use super::rays::Ray;
-use super::sampler::{RayLanes, Sampler, Sampling, Steer};
+use super::sampler::{Lanes, RayLanes, Sampler, Sampling, Steer};
 use crate::rng::Rng;
 
 const SAMPLING: Sampling = Sampling { count: 24, step: 1.0 / 64.0, explore: 0.2, sharpness: 1.0 };
@@ -17,13 +17,13 @@ fn ray(start: f32, end: f32) -> Ray {
 struct Along<F>(F);
 
 impl<F: Fn(f32) -> f32> Steer for Along<F> {
-    type Cells = [f32; STRIDE];
+    type Cells = Lanes;
 
-    fn find(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
+    fn find(&self, _: &[Lanes; 3], t: &Lanes) -> Lanes {
         *t
     }
 
-    fn sigma(&self, t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
+    fn sigma(&self, t: &Lanes) -> [Lanes; 2] {
         [t.map(&self.0), [0.0; STRIDE]]
     }
 }
@@ -113,13 +113,13 @@ fn a_ray_that_misses_the_box_places_nothing() {
 struct Two<F, G>(F, G);
 
 impl<F: Fn(f32) -> f32, G: Fn(f32) -> f32> Steer for Two<F, G> {
-    type Cells = [f32; STRIDE];
+    type Cells = Lanes;
 
-    fn find(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
+    fn find(&self, _: &[Lanes; 3], t: &Lanes) -> Lanes {
         *t
     }
 
-    fn sigma(&self, t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
+    fn sigma(&self, t: &Lanes) -> [Lanes; 2] {
         [t.map(&self.0), t.map(&self.1)]
     }
 }

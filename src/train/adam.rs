@@ -96,12 +96,9 @@ impl TableState {
             if seen & 1 << AHEAD != 0 {
                 let line = (ahead - AHEAD) * LINE..g.len().min((ahead - AHEAD + 1) * LINE);
                 updated += line.len();
-                let [w, g, m, v] = [&mut *w, &mut *g, &mut *m, &mut *v];
-                update_seen(
-                    simd,
-                    [&mut w[line.clone()], &mut g[line.clone()], &mut m[line.clone()], &mut v[line]],
-                    step,
-                );
+                let of_line =
+                    [&mut w[line.clone()], &mut g[line.clone()], &mut m[line.clone()], &mut v[line]];
+                update_seen(simd, of_line, step);
             }
         }
         updated / FEATURES

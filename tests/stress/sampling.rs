@@ -2,7 +2,7 @@
 
 use divff::render::density_grid::STRIDE;
 use divff::render::rays::Ray;
-use divff::render::sampler::{RayLanes, Sampler, Sampling, Steer};
+use divff::render::sampler::{Lanes, RayLanes, Sampler, Sampling, Steer};
 use glam::Vec3;
 
 use crate::SIZES;
@@ -12,13 +12,13 @@ use crate::rng::Rng;
 struct Stretches(Vec<f32>);
 
 impl Steer for Stretches {
-    type Cells = [f32; STRIDE];
+    type Cells = Lanes;
 
-    fn find(&self, _: &[[f32; STRIDE]; 3], t: &[f32; STRIDE]) -> [f32; STRIDE] {
+    fn find(&self, _: &[Lanes; 3], t: &Lanes) -> Lanes {
         *t
     }
 
-    fn sigma(&self, t: &[f32; STRIDE]) -> [[f32; STRIDE]; 2] {
+    fn sigma(&self, t: &Lanes) -> [Lanes; 2] {
         let stretch = |t: f32| (t * self.0.len() as f32) as usize % self.0.len();
         [t.map(|t| self.0[stretch(t)]), t.map(|t| self.0[self.0.len() - 1 - stretch(t)])]
     }

@@ -143,7 +143,7 @@ impl Mlp {
 
     /// Number of parameters.
     pub fn parameters(&self) -> usize {
-        self.layers.iter().map(|l| l.weights() + l.n_out).sum()
+        parameters(&self.layers)
     }
 
     /// Multiply-adds of one sample's forward pass.
@@ -317,6 +317,11 @@ impl Mlp {
             Packed::Matrix(_) => a.sums.add_to(out),
         }
     }
+}
+
+/// Number of parameters of some layers.
+fn parameters(layers: &[Layer]) -> usize {
+    layers.iter().map(|l| l.weights() + l.n_out).sum()
 }
 
 /// Where one layer's numbers are.

@@ -9,11 +9,6 @@ use crate::simd::{TILE, add_sums};
 /// The gradients of the weights of four outputs for one input, or of their biases.
 pub type Block = [f32; BLOCK];
 
-/// Numbers that are summed.
-pub fn len(layers: &[Layer]) -> usize {
-    layers.iter().map(|l| l.weights() + l.n_out).sum()
-}
-
 /// Adds the parameter gradients of a strip to `sums`.
 ///
 /// Layer by layer, of four outputs after the other the weights input by input, then the biases.

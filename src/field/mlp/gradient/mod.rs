@@ -10,7 +10,7 @@ mod by_samples;
 
 use pulp::Simd;
 
-use super::{Layer, is_like_avx2};
+use super::{Layer, is_like_avx2, parameters};
 use crate::simd::matrix::Pairs;
 use crate::simd::{AlignedVec, TILE};
 
@@ -59,7 +59,7 @@ impl Sums {
         if is_like_avx2::<S>() {
             by_outputs::accumulate(simd, layers, strip, self.of(by_outputs::len(layers)), &mut panel);
         } else {
-            by_samples::accumulate(simd, layers, strip, self.of(by_samples::len(layers)));
+            by_samples::accumulate(simd, layers, strip, self.of(parameters(layers)));
         }
         self.panel = panel;
     }
@@ -68,7 +68,7 @@ impl Sums {
     #[inline(always)]
     pub fn add_rounded(&mut self, layers: &[Layer], strip: Strip<Pairs>) {
         let mut panel = std::mem::take(&mut self.panel);
-        by_pairs::accumulate(layers, strip, self.of(by_samples::len(layers)), &mut panel);
+        by_pairs::accumulate(layers, strip, self.of(parameters(layers)), &mut panel);
         self.panel = panel;
     }
 
