@@ -135,6 +135,7 @@ fn a_training_without_faint_samples_learns_the_same() {
     };
     let ((all, everything), (bright, progress)) = (learn(0.0), learn(1e-4));
     assert_eq!(everything.faint, 0);
-    assert!(progress.faint > progress.evaluations / 100, "{progress:?}");
+    // Some 1 % of all: 2 % of those after `skip_after`.
+    assert!(progress.faint > progress.evaluations / 200, "{progress:?}");
     assert!(bright > all - 0.5, "{all} dB with faint samples, {bright} dB without");
 }
