@@ -65,7 +65,7 @@ impl Work {
             }
         }
         // Values and two moments are read and written; gradients need not leave a near cache.
-        self.bytes += (6 * report.updated * size_of::<Row>()) as f64;
+        self.bytes += (6 * report.rows.updated * size_of::<Row>()) as f64;
     }
 
     /// Least seconds for networks, rows, moments and cells.
@@ -93,7 +93,7 @@ struct Looked {
     evaluations: usize,
     /// Seconds that networks, rows, moments and cells take at least.
     floor: [f64; 4],
-    /// Seconds of all, of placing, encoding, evaluating and updating.
+    /// Seconds of all, of placing, the tables, evaluating and updating all else.
     seconds: [f64; 5],
 }
 
@@ -101,10 +101,10 @@ impl Looked {
     /// Takes [`STEPS`] steps at the share `fraction` of the schedule, on what can do `flops` operations a second.
     fn at(trainer: &mut Trainer, fraction: f64, machine: &Machine, flops: f64) -> Result<Self, TrainError> {
         let (mut looked, mut work) = (Self { steps: STEPS, ..Self::default() }, Work::default());
-        for _ in 0..STEPS {
-            let start = Instant::now();
-            let report = trainer.step(fraction, None)?;
-            looked.seconds[0] += start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let reports = trainer.steps(fraction, STEPS)?;
+        looked.seconds[0] = start.elapsed().as_secs_f64();
+        for report in reports {
             (0..4).for_each(|n| looked.seconds[1 + n] += report.seconds[n]);
             looked.evaluations += report.evaluations.iter().sum::<usize>();
             work.add(&trainer.trained().field, &report);
@@ -151,7 +151,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let rows: usize = trainer.trained().field.tables.iter().flatten().map(Vec::len).sum();
     let bf16 = config.train.precision.is_bf16();
     println!(
-        "   at evaluations  networks  rows  moments  cells  floor/ms   time  placing  encoding  evaluating  updating    floor"
+        "   at evaluations  networks  rows  moments  cells  floor/ms   time  placing    tables  evaluating  updating    floor"
     );
     let mut all = Looked::default();
     for part in 0..PARTS {

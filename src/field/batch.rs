@@ -68,6 +68,14 @@ pub struct StreamBatch {
     pub slopes: bool,
     /// Lanes that [`Self::retain`] leaves.
     pub(super) kept: Vec<u32>,
+    put_off: PutOff,
+}
+
+/// Samples whose gradients are still in the rows of a batch's levels.
+#[derive(Default)]
+struct PutOff {
+    pos: Vec<Points>,
+    lanes: usize,
 }
 
 /// Moves what stands at the places `kept`, in increasing order, of `values` to their front.
@@ -79,6 +87,14 @@ fn compact<T: Copy>(values: &mut [T], kept: &[u32]) {
 }
 
 impl StreamBatch {
+    /// Forgets all samples but for where they were, so that what the way back has left in the levels can be added to the tables
+    /// right before new samples are encoded: see [`LevelTask`].
+    pub fn put_off(&mut self) {
+        std::mem::swap(&mut self.put_off.pos, &mut self.pos);
+        self.put_off.lanes = self.len();
+        self.clear();
+    }
+
     /// Forgets all samples.
     pub fn clear(&mut self) {
         self.sample.clear();
@@ -105,7 +121,7 @@ impl StreamBatch {
     /// Leaves the samples of whose number in the chunk `keep` is true, encoded as they are if they are `encoded`.
     #[inline(always)]
     pub(super) fn retain(&mut self, keep: impl Fn(usize) -> bool, encoded: bool) {
-        let Self { sample, ray, pos, levels, slopes, kept } = self;
+        let Self { sample, ray, pos, levels, slopes, kept, .. } = self;
         kept.clear();
         kept.extend((0..sample.len() as u32).filter(|lane| keep(sample[*lane as usize] as usize)));
         let tiles = kept.len().div_ceil(TILE);
@@ -155,6 +171,7 @@ impl StreamBatch {
     }
 
     /// Positions tile by tile, and what level number `level` says about them, or the gradient with respect to that.
+    #[cfg(test)]
     pub fn encoded(&self, level: usize) -> impl Iterator<Item = (&Points, &[Row])> {
         self.pos.iter().zip(self.levels[level].rows[..self.len()].chunks(TILE))
     }
@@ -163,37 +180,37 @@ impl StreamBatch {
     #[inline(always)]
     pub fn encode(&mut self, encoding: &Encoding, tables: &[Vec<Row>]) {
         let mut around = Around::default();
-        for task in self.tasks(encoding, tables) {
-            task.run(&mut around);
+        for (task, table) in self.tasks(encoding).into_iter().zip(tables) {
+            task.encode(table, &mut around);
         }
     }
 
-    /// The encoding to be made of the samples, level by level: see [`LevelTask::run`].
-    pub fn tasks<'a>(&'a mut self, encoding: &'a Encoding, tables: &'a [Vec<Row>]) -> Vec<LevelTask<'a>> {
-        let Self { sample, pos, levels, slopes, .. } = self;
+    /// What is to be done on each level.
+    pub fn tasks<'a>(&'a mut self, encoding: &'a Encoding) -> Vec<LevelTask<'a>> {
+        let Self { sample, pos, levels, slopes, put_off, .. } = self;
         levels.resize_with(encoding.levels.len(), LevelRows::default);
-        let parts = encoding.levels.iter().zip(tables).zip(levels);
+        let parts = encoding.levels.iter().zip(levels);
         parts
-            .map(|((level, table), out)| {
-                let batch = LevelBatch { pos, lanes: sample.len(), slopes: *slopes, out };
-                LevelTask { level, table, batches: vec![batch] }
+            .map(|(level, out)| {
+                let batch = LevelBatch { put_off, pos, lanes: sample.len(), slopes: *slopes, out };
+                LevelTask { level, batches: vec![batch] }
             })
             .collect()
     }
 }
 
-/// The encoding of batches on one level.
+/// What batches have to do on one level: to scatter what was put off, then to encode their samples.
 ///
 /// Whoever has many batches does one level of all of them before the next: a level's table fits a core's L2, all of
 /// them together do not.
 pub struct LevelTask<'a> {
     level: &'a Level,
-    table: &'a [Row],
     batches: Vec<LevelBatch<'a>>,
 }
 
-/// Where one level is to say something about the samples of one batch.
+/// Where one level is to say something about the samples of one batch, in the place of the gradients of those that were put off.
 struct LevelBatch<'a> {
+    put_off: &'a PutOff,
     pos: &'a [Points],
     lanes: usize,
     slopes: bool,
@@ -206,16 +223,22 @@ impl LevelTask<'_> {
         self.batches.append(&mut other.batches);
     }
 
-    /// Rows that it looks up, or points where there are none.
+    /// Rows that it looks up and adds to, or points where there are none.
     pub fn cost(&self) -> usize {
-        let lanes: usize = self.batches.iter().map(|batch| batch.lanes).sum();
+        let lanes: usize = self.batches.iter().map(|batch| batch.put_off.lanes + batch.lanes).sum();
         lanes * self.level.corners().max(1)
     }
 
-    /// Looks up and interpolates.
+    /// Adds the gradients of the samples that were put off to those of the table's rows.
     #[inline(always)]
-    pub fn run(self, around: &mut Around) {
-        let Self { level, table, mut batches } = self;
+    pub fn scatter(&self, gradient: &mut [Row], around: &mut Around) {
+        self.level.scatter(gradient, self.batches.iter().flat_map(LevelBatch::put_off), around);
+    }
+
+    /// Looks up the samples in the table, and interpolates.
+    #[inline(always)]
+    pub fn encode(self, table: &[Row], around: &mut Around) {
+        let Self { level, mut batches } = self;
         batches.iter_mut().for_each(LevelBatch::make_room);
         let (steep, flat): (Vec<_>, Vec<_>) = batches.into_iter().partition(|batch| batch.slopes);
         level.encode(table, flat.into_iter().flat_map(LevelBatch::tiles), around);
@@ -235,6 +258,11 @@ impl<'a> LevelBatch<'a> {
         if self.slopes && self.out.slopes.len() < wanted {
             self.out.slopes.resize(wanted, [Row::ZERO; 3]);
         }
+    }
+
+    fn put_off(&self) -> impl Iterator<Item = (&Points, &[Row])> {
+        let PutOff { pos, lanes } = self.put_off;
+        pos.iter().zip(self.out.rows[..*lanes].chunks(TILE))
     }
 
     fn tiles(self) -> impl Iterator<Item = (&'a Points, &'a mut [Row])> {

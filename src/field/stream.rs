@@ -43,10 +43,8 @@ pub struct StreamNet {
     pub density_bias: f32,
 }
 
-/// A stream's parameters as the kernels read them during one step.
+/// A stream's networks as the kernels read them during one step.
 pub struct StreamWeights<'a> {
-    /// One table a level.
-    pub tables: &'a [Vec<Row>],
     /// Packed trunk.
     pub trunk: &'a Packed,
     /// Packed head.
@@ -115,12 +113,6 @@ impl StreamNet {
         let trunk = Mlp::with_skip(&trunk, widths.skip);
         let head = Mlp::new(&[trunk.output() + view, widths.head, 4]);
         Self { encoding, trunk, head, code, view, density_bias: bias }
-    }
-
-    /// Encodes all samples of `batch`.
-    #[inline(always)]
-    pub fn encode(&self, w: &StreamWeights, batch: &mut StreamBatch) {
-        batch.encode(&self.encoding, w.tables);
     }
 
     /// Evaluates all samples of an encoded `batch`; `code` and `view` give the conditioning of a ray.
@@ -426,7 +418,7 @@ mod tests {
                 (field.net(Stream::Dynamic).expect("all streams are on"), &field.layout.streams[1]);
             let [trunk, head] = [(&net.trunk, &r.trunk), (&net.head, &r.head)]
                 .map(|(net, range)| net.pack_for(&field.weights[range.clone()], arithmetic));
-            let w = StreamWeights { tables: &field.tables[1], trunk: &trunk, head: &head };
+            let w = StreamWeights { trunk: &trunk, head: &head };
             let (mut activations, mut out) = (StreamActivations::default(), StreamSamples::default());
             out.reset(COUNT);
             let (code, view) = (|_: usize| &[0.3; 64][..], |_: usize| &[0.2; 64][..]);

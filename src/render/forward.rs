@@ -110,10 +110,10 @@ impl<'a> Model<'a> {
         Self { field, packed, grids, streams }
     }
 
-    /// What the kernels of one stream read.
+    /// What the networks of one stream read.
     pub fn weights(&self, s: usize) -> Option<StreamWeights<'_>> {
         let (trunk, head) = self.packed[s].as_ref()?;
-        Some(StreamWeights { tables: &self.field.tables[s], trunk, head })
+        Some(StreamWeights { trunk, head })
     }
 
     /// Actor coordinates of a point at z-depth `z` seen at image fraction `uv`: inverse depth as third coordinate.
@@ -348,8 +348,8 @@ impl Chunk {
     #[inline(always)]
     fn encode(&mut self, model: &Model) {
         for (s, batch) in self.batches.iter_mut().enumerate() {
-            if let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) {
-                net.encode(&w, batch);
+            if let Some(net) = &model.field.nets[s] {
+                batch.encode(&net.encoding, &model.field.tables[s]);
             }
         }
     }

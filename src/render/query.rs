@@ -76,6 +76,11 @@ impl<'a> Query<'a> {
         }
         (0..points.len()).map(|n| [0, 1, 2].map(|c| out.rgb[c][n])).collect()
     }
+
+    #[inline(always)]
+    fn encode(&self, batch: &mut StreamBatch) {
+        batch.encode(&self.net.encoding, &self.model.field.tables[self.stream as usize]);
+    }
 }
 
 struct DensityPass<'a> {
@@ -93,7 +98,7 @@ impl WithSimd for DensityPass<'_> {
         let Self { query, weights, batch, out } = self;
         let code = |_: usize| &query.code[..];
         let mut activations = StreamActivations::default();
-        query.net.encode(&weights, batch);
+        query.encode(batch);
         query.net.density(simd, &weights, batch, &mut activations, Tiles::Passing, code, out);
     }
 }
@@ -115,7 +120,7 @@ impl WithSimd for ColourPass<'_> {
         let code = |_: usize| &query.code[..];
         let view = |n: usize| &views[n][..];
         let mut activations = StreamActivations::default();
-        query.net.encode(&weights, batch);
+        query.encode(batch);
         query.net.forward(simd, &weights, batch, &mut activations, Tiles::Passing, code, view, out);
     }
 }

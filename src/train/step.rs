@@ -1,10 +1,11 @@
 //! One training step.
 //!
 //! A fixed number of groups of chunks of rays run in parallel, each with its own gradient of the dense weights; hash
-//! tables are read and updated by one task a level, which walks all chunks in order while that level's table stays in
-//! its core's cache. So the phases of a step are: groups choose rays and place samples; levels encode them; groups
-//! evaluate the networks, the loss and go backward; levels scatter and update. There are no atomics, and the result
-//! does not depend on the number of threads.
+//! tables are updated and read by one task a level, which walks all chunks in order while that level's table stays near
+//! its core. So the phases of a step are: groups choose rays and place samples, for which no table is needed; levels
+//! scatter what the step before has found, update their tables and encode the samples; groups evaluate the networks, the
+//! loss and go backward; density grids and dense weights are updated. What the last step has found waits for
+//! [`Optimiser::settle`]. There are no atomics in any sum, and the result does not depend on the number of threads.
 
 use std::time::Instant;
 
@@ -13,14 +14,14 @@ use rayon::prelude::*;
 
 use self::group::{Context, Group, Scratch};
 use self::update::update;
-use super::adam::{Moments, TableState};
+use super::adam::{Moments, StepSize, TableState};
 use super::loss::LossConfig;
 use super::pixels::PixelSet;
-use super::table_pass::TableScratch;
+use super::table_pass::{StreamTables, TableScratch, update_and_encode};
 use crate::field::Field;
-use crate::field::batch::LevelTask;
-use crate::field::hashgrid::Around;
+use crate::field::hashgrid::Row;
 use crate::field::mlp::Precision;
+use crate::field::stream::StreamNet;
 use crate::render::forward::{Chunk, Grids, Model};
 use crate::render::rays::View;
 use crate::render::sampler::Sampling;
@@ -118,16 +119,23 @@ pub struct StepReport {
     pub taken: u64,
     /// Steps through the density grids that rays were spared because nothing was left of their light.
     pub spared: u64,
-    /// Rows of tables that were updated, with those beside them on a cache line.
-    pub updated: usize,
-    /// All other rows of the streams that took part.
-    pub unseen: usize,
+    /// What became of the tables: by the step before, unless [`Optimiser::settle`] was asked in between.
+    pub rows: RowReport,
     /// Evaluations from which no pose was to learn, of those from which one would have.
     pub unrefined: usize,
     /// Number of the first chunk of rays whose loss is not finite.
     pub diverged: Option<usize>,
-    /// Seconds that placing, encoding, evaluating (both ways) and updating took.
+    /// Seconds that placing, the tables, evaluating (both ways) and updating all else took.
     pub seconds: [f64; 4],
+}
+
+/// Rows of the tables that a step did and did not change.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct RowReport {
+    /// Rows that were updated, with those beside them on a cache line.
+    pub updated: usize,
+    /// All other rows of the streams that took part.
+    pub unseen: usize,
 }
 
 /// All state of training but the field itself.
@@ -137,9 +145,19 @@ pub struct Optimiser {
     /// State of every table `[stream][level]`.
     pub tables: [Vec<TableState>; 3],
     groups: Vec<Group>,
+    /// What a step has left to be done.
+    put_off: Option<PutOff>,
     scratch: PerThread<Scratch>,
     table_scratch: PerThread<TableScratch>,
     gradient: Vec<f32>,
+}
+
+/// An update of the tables by what the samples of all groups have found.
+struct PutOff {
+    rate: StepSize,
+    streams: [bool; 3],
+    /// How many chunks of rays they are of.
+    chunks: usize,
 }
 
 impl Optimiser {
@@ -149,6 +167,7 @@ impl Optimiser {
             dense: Moments::new(field.layout.len),
             tables: field.tables.each_ref().map(|t| t.iter().map(|t| TableState::new(t.len())).collect()),
             groups: Vec::new(),
+            put_off: None,
             scratch: PerThread::default(),
             table_scratch: PerThread::default(),
             gradient: vec![0.0; field.layout.len],
@@ -166,6 +185,8 @@ impl Optimiser {
     }
 
     /// Runs one step, for the colours of random pixels, or for those and another loss of the companion's pixels.
+    ///
+    /// The tables are updated as the next step begins, which reads them; whoever else does, asks for [`Self::settle`] first.
     #[allow(clippy::too_many_arguments)]
     pub fn step(
         &mut self,
@@ -179,33 +200,56 @@ impl Optimiser {
     ) -> StepReport {
         let start = Instant::now();
         let chunks = chunks(plan.rays);
+        // Other groups could not tell what these have found.
+        let settled = self.put_off.as_ref().is_some_and(|p| p.chunks != chunks).then(|| self.settle(field));
         let rays = chunks * CHUNK_RAYS;
         self.groups.resize_with(chunks.min(GROUPS), Group::default);
-        let scratch = &self.scratch;
-        let chunks = chunks / self.groups.len().max(1);
+        let per_group = chunks / self.groups.len().max(1);
         let mut views: Vec<View> = pixels.frames.iter().map(|f| View::new(field, f)).collect();
         for (n, view) in views.iter_mut().enumerate() {
             let mut rng = Rng::new(seed, plan.step, TIMES - n as u64);
             view.time = pixels.time_near(n, plan.time_spread, rng.uniform());
         }
+        // Nobody but the pass over them needs them in between.
+        let mut tables = std::mem::take(&mut field.tables);
         let model = Model::with_precision(field, grids, plan.streams, plan.precision);
         let context = Context { model: &model, pixels, views: &views, config, plan, seed, rays, companion };
         let arch = pulp::Arch::new();
         // One by one: rayon would hand out several together, and a thread then waits for the other at the end.
         self.groups.par_iter_mut().enumerate().with_max_len(1).for_each(|(n, group)| {
-            arch.dispatch(PlacePass { context: &context, group, scratch, first_chunk: n * chunks, chunks });
+            arch.dispatch(PlacePass {
+                context: &context,
+                group,
+                scratch: &self.scratch,
+                first_chunk: n * per_group,
+                chunks: per_group,
+            });
         });
         let placed = Instant::now();
-        encode(&mut self.groups, &model);
+        let rows = self.update_tables(&model.field.nets, &mut tables);
         let encoded = Instant::now();
         let mut tasks = Tasks::default();
         for group in &mut self.groups {
-            let pass = EvaluatePass { context: &context, group, scratch };
+            let pass = EvaluatePass { context: &context, group, scratch: &self.scratch };
             tasks.add(pass.group.samples(), move || arch.dispatch(pass));
         }
         tasks.run();
         drop(model);
+        field.tables = tables;
+        let rate = StepSize::new(plan.table_rate, plan.step);
+        self.put_off = Some(PutOff { rate, streams: plan.streams, chunks });
         let evaluated = Instant::now();
+        let mut report = self.report(field, plan, rays);
+        report.rows = settled.unwrap_or(rows);
+        update(self, field, grids, plan);
+        let ends = [placed, encoded, evaluated, Instant::now()];
+        let starts = [start, placed, encoded, evaluated];
+        report.seconds = std::array::from_fn(|n| (ends[n] - starts[n]).as_secs_f64());
+        report
+    }
+
+    /// What the groups have done.
+    fn report(&self, field: &Field, plan: &StepPlan, rays: usize) -> StepReport {
         let mut report = StepReport { rays, ..StepReport::default() };
         for g in &self.groups {
             report.loss += g.loss.total / rays as f64;
@@ -226,34 +270,32 @@ impl Optimiser {
             let [evaluations, faint] = [report.evaluations, report.faint].map(|n| n.iter().sum::<usize>());
             report.unrefined = (evaluations - faint) / group::REFINE_EVERY as usize;
         }
-        report.updated = update(self, field, grids, plan);
-        let live = field.tables.iter().zip(plan.streams).filter(|(_, live)| *live);
-        report.unseen = live.flat_map(|(tables, _)| tables).map(Vec::len).sum::<usize>() - report.updated;
-        let ends = [placed, encoded, evaluated, Instant::now()];
-        let starts = [start, placed, encoded, evaluated];
-        report.seconds = std::array::from_fn(|n| (ends[n] - starts[n]).as_secs_f64());
         report
     }
-}
 
-/// Encodes the samples of all groups, one level after the other.
-fn encode(groups: &mut [Group], model: &Model) {
-    let mut levels: [Vec<LevelTask>; 3] = Default::default();
-    for (s, batch) in groups.iter_mut().flat_map(Group::batches) {
-        let (Some(net), Some(w)) = (&model.field.nets[s], model.weights(s)) else { continue };
-        let of_batch = batch.tasks(&net.encoding, w.tables);
-        if levels[s].is_empty() {
-            levels[s] = of_batch;
-        } else {
-            levels[s].iter_mut().zip(of_batch).for_each(|(task, of_batch)| task.append(of_batch));
+    /// Updates the tables by what the last step has found, unless that is done.
+    pub fn settle(&mut self, field: &mut Field) -> RowReport {
+        if self.put_off.is_none() {
+            return RowReport::default();
         }
+        self.groups.iter_mut().for_each(Group::put_off);
+        self.update_tables(&field.nets, &mut field.tables)
     }
-    let arch = pulp::Arch::new();
-    let mut tasks = Tasks::default();
-    for level in levels.into_iter().flatten() {
-        tasks.add(level.cost(), move || arch.dispatch(EncodePass(level)));
+
+    /// Updates the tables by what was put off, and encodes what the groups have placed.
+    fn update_tables(&mut self, nets: &[Option<StreamNet>; 3], tables: &mut [Vec<Vec<Row>>; 3]) -> RowReport {
+        let Self { tables: states, groups, put_off, table_scratch, .. } = self;
+        let put_off = put_off.take();
+        let rate = |s: usize| put_off.as_ref().filter(|p| p.streams[s]).map(|p| p.rate);
+        let all: usize = (0..3).filter(|s| rate(*s).is_some()).flat_map(|s| &tables[s]).map(Vec::len).sum();
+        let mut parts = nets.iter().zip(tables).zip(states).enumerate();
+        let streams = [(); 3].map(|()| {
+            let (s, ((net, tables), states)) = parts.next()?;
+            Some(StreamTables { encoding: &net.as_ref()?.encoding, tables, states, rate: rate(s) })
+        });
+        let updated = update_and_encode(streams, groups.iter_mut().flat_map(Group::batches), table_scratch);
+        RowReport { updated, unseen: all - updated }
     }
-    tasks.run();
 }
 
 struct PlacePass<'a> {
@@ -270,17 +312,6 @@ impl WithSimd for PlacePass<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
         self.group.place(self.context, &mut self.scratch.mine(), self.first_chunk, self.chunks);
-    }
-}
-
-struct EncodePass<'a>(LevelTask<'a>);
-
-impl WithSimd for EncodePass<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        self.0.run(&mut Around::default());
     }
 }
 

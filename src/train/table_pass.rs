@@ -1,12 +1,15 @@
-//! The end of a step for one table: what all batches found out about its rows goes into them.
+//! The tables' part of a step: each takes what the last samples have found out about its rows, and then says what it is at
+//! the next ones, while it is near a core.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use pulp::{Simd, WithSimd};
 
 use super::adam::{StepSize, TableState};
-use crate::field::batch::StreamBatch;
-use crate::field::encoding::Level;
+use crate::field::batch::{LevelTask, StreamBatch};
+use crate::field::encoding::Encoding;
 use crate::field::hashgrid::{Around, Row};
-use crate::tasks::PerThread;
+use crate::tasks::{PerThread, Tasks};
 
 /// Buffers of one thread, used for one table after the other.
 #[derive(Default)]
@@ -16,45 +19,82 @@ pub struct TableScratch {
     around: Around,
 }
 
-/// Scatters one level's gradients, batch after batch, and updates its table; gives the rows that it has updated.
-pub struct TablePass<'a, B> {
-    /// Batches that were encoded and gone back through.
-    pub batches: B,
-    /// Number of the level.
-    pub number: usize,
-    /// What it is.
-    pub level: &'a Level,
-    /// Its rows.
-    pub table: &'a mut [Row],
+/// The tables of one stream.
+pub struct StreamTables<'a> {
+    /// What the levels are.
+    pub encoding: &'a Encoding,
+    /// Their rows.
+    pub tables: &'a mut [Vec<Row>],
     /// Moments of the rows.
-    pub state: &'a mut TableState,
-    /// How far a step goes.
-    pub rate: StepSize,
-    /// Buffers of the threads, of which the pass takes its own thread's.
-    pub scratch: &'a PerThread<TableScratch>,
+    pub states: &'a mut [TableState],
+    /// How far a step goes; `None` where no gradients were put off.
+    pub rate: Option<StepSize>,
 }
 
-impl<'a, B: Iterator<Item = &'a StreamBatch> + Clone> TablePass<'a, B> {
-    /// Rows that it adds to, and rows that it updates, which take about as long.
-    pub fn cost(&self) -> usize {
-        let points: usize = self.batches.clone().map(StreamBatch::len).sum();
-        points * self.level.corners() + self.table.len()
+/// Updates tables by the gradients that batches have [put off](StreamBatch::put_off), and encodes the batches' samples, level by
+/// level; batches come with the number of their stream. Gives the rows that were updated, with those beside them on a cache line.
+pub fn update_and_encode<'a>(
+    streams: [Option<StreamTables<'a>>; 3],
+    batches: impl Iterator<Item = (usize, &'a mut StreamBatch)>,
+    scratch: &PerThread<TableScratch>,
+) -> usize {
+    let mut levels: [Vec<LevelTask>; 3] = Default::default();
+    for (s, batch) in batches {
+        let Some(StreamTables { encoding, .. }) = streams[s] else { continue };
+        let of_batch = batch.tasks(encoding);
+        if levels[s].is_empty() {
+            levels[s] = of_batch;
+        } else {
+            levels[s].iter_mut().zip(of_batch).for_each(|(task, of_batch)| task.append(of_batch));
+        }
+    }
+    let arch = pulp::Arch::new();
+    let (mut tasks, updated) = (Tasks::default(), &AtomicUsize::new(0));
+    for (stream, levels) in streams.into_iter().zip(levels) {
+        let Some(StreamTables { tables, states, rate, .. }) = stream else { continue };
+        for ((task, table), state) in levels.into_iter().zip(tables).zip(states) {
+            let pass = TablePass { task, table, state, rate, scratch };
+            tasks.add(pass.cost(), move || {
+                updated.fetch_add(arch.dispatch(pass), Ordering::Relaxed);
+            });
+        }
+    }
+    tasks.run();
+    updated.load(Ordering::Relaxed)
+}
+
+/// Scatters one level's gradients, batch after batch, updates its table, and encodes on that level.
+struct TablePass<'a> {
+    task: LevelTask<'a>,
+    table: &'a mut [Row],
+    state: &'a mut TableState,
+    rate: Option<StepSize>,
+    scratch: &'a PerThread<TableScratch>,
+}
+
+impl TablePass<'_> {
+    /// Rows that it adds to and looks up, and rows that it updates, which take about as long.
+    fn cost(&self) -> usize {
+        self.task.cost() + self.rate.map_or(0, |_| self.table.len())
     }
 }
 
-impl<'a, B: Iterator<Item = &'a StreamBatch>> WithSimd for TablePass<'_, B> {
+impl WithSimd for TablePass<'_> {
     type Output = usize;
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> usize {
-        let Self { batches, number, level, table, state, rate, scratch } = self;
+        let Self { task, table, state, rate, scratch } = self;
         let TableScratch { gradient, around } = &mut *scratch.mine();
-        if gradient.len() < table.len() {
-            gradient.resize(table.len(), Row::ZERO);
-        }
-        let gradient = &mut gradient[..table.len()];
-        let tiles = batches.filter(|b| !b.is_empty()).flat_map(|b| b.encoded(number));
-        level.scatter(gradient, tiles, around);
-        state.update(simd, table, gradient, rate)
+        let updated = rate.map_or(0, |rate| {
+            if gradient.len() < table.len() {
+                gradient.resize(table.len(), Row::ZERO);
+            }
+            let gradient = &mut gradient[..table.len()];
+            task.scatter(gradient, around);
+            state.update(simd, table, gradient, rate)
+        });
+        task.encode(table, around);
+        updated
     }
 }

@@ -191,7 +191,7 @@ impl Trainer {
             if self.config.train.skips(self.trained.progress.step + 1, fraction) {
                 self.trained.grids.skip_below(OCCUPIED_ALPHA);
             }
-            let report = self.step(fraction, None)?;
+            let report = self.begin_step(fraction, None)?;
             self.count(&report);
             window.add(&report);
             self.trained.progress.seconds = before + start.elapsed().as_secs_f64();
@@ -253,7 +253,8 @@ impl Trainer {
     ///
     /// # Errors
     /// A number that is not finite, or a file that cannot be written; an older one is then untouched.
-    pub fn save(&self, run: &Path) -> Result<(), TrainError> {
+    pub fn save(&mut self, run: &Path) -> Result<(), TrainError> {
+        self.settle();
         // A row that has diverged shows in the loss when a ray passes it next, which may be never.
         let rows = self.trained.field.tables.iter().flatten().flatten();
         if let Some(index) = rows.into_iter().position(|row| !row.is_finite()) {
@@ -275,7 +276,7 @@ impl Trainer {
         progress.candidates += report.candidates as u64;
         progress.absent += report.absent as u64;
         progress.spared += report.spared;
-        progress.unseen += report.unseen as u64;
+        progress.unseen += report.rows.unseen as u64;
         if progress.trusts_poses {
             progress.unrefined += report.unrefined as u64;
         }
@@ -286,6 +287,34 @@ impl Trainer {
     /// # Errors
     /// The numbers diverge.
     pub fn step(
+        &mut self,
+        fraction: f64,
+        companion: Option<&dyn Companion>,
+    ) -> Result<StepReport, TrainError> {
+        let report = self.begin_step(fraction, companion)?;
+        Ok(StepReport { rows: self.optimiser.settle(&mut self.trained.field), ..report })
+    }
+
+    /// Takes `count` steps as at the share `fraction` of the schedule.
+    ///
+    /// # Errors
+    /// The numbers diverge.
+    pub fn steps(&mut self, fraction: f64, count: usize) -> Result<Vec<StepReport>, TrainError> {
+        let mut reports = Vec::with_capacity(count);
+        for _ in 0..count {
+            reports.push(self.begin_step(fraction, None)?);
+        }
+        // The rows of a step are known when the next one has begun.
+        let mut rows = self.optimiser.settle(&mut self.trained.field);
+        for report in reports.iter_mut().rev() {
+            std::mem::swap(&mut report.rows, &mut rows);
+        }
+        Ok(reports)
+    }
+
+    /// Takes a step but for the tables, which take what it has found as the next one begins, or when they are
+    /// [settled](Self::settle).
+    fn begin_step(
         &mut self,
         fraction: f64,
         companion: Option<&dyn Companion>,
@@ -313,10 +342,17 @@ impl Trainer {
         }
     }
 
-    fn test_psnr(&self) -> Option<f64> {
+    /// Has the tables take what the last step has found, before anyone else looks at them.
+    fn settle(&mut self) {
+        let rows = self.optimiser.settle(&mut self.trained.field);
+        self.trained.progress.unseen += rows.unseen as u64;
+    }
+
+    fn test_psnr(&mut self) -> Option<f64> {
         if self.test.frames.is_empty() {
             return None;
         }
+        self.settle();
         let model = Model::new(&self.trained.field, &self.trained.grids, self.streams);
         let sampling = self.config.train.look_sampling();
         let pixels: usize = self.test.images.iter().map(Vec::len).sum();

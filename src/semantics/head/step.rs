@@ -19,9 +19,9 @@ use crate::scene::features::Space;
 use crate::semantics::SemanticsError;
 use crate::simd::TILE;
 use crate::simd::matrix::Unit;
-use crate::tasks::{PerThread, Tasks};
+use crate::tasks::PerThread;
 use crate::train::adam::{self, Moments, StepSize, TableState};
-use crate::train::table_pass::{TablePass, TableScratch};
+use crate::train::table_pass::{StreamTables, TableScratch, update_and_encode};
 
 mod joint;
 
@@ -206,25 +206,19 @@ impl HeadOptimiser {
 
     fn update(&mut self, heads: &mut Heads, plan: &HeadStep) {
         let Self { moments, tables, groups, scratch } = self;
-        let (groups, scratch) = (&groups[..], &*scratch);
-        let (arch, rate) = (pulp::Arch::new(), StepSize::new(plan.table_rate, plan.step));
-        let mut tasks = Tasks::default();
-        for (s, (tables, states)) in heads.tables.iter_mut().zip(tables).enumerate() {
-            let Some(net) = &heads.nets[s] else { continue };
-            let levels = net.grid.levels.iter().enumerate();
-            for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)) {
-                let batches = groups.iter().map(move |g| &g.batches[s]);
-                let pass = TablePass { batches, number, level, table, state, rate, scratch };
-                tasks.add(pass.cost(), move || {
-                    arch.dispatch(pass);
-                });
-            }
-        }
-        tasks.run();
+        let rate = Some(StepSize::new(plan.table_rate, plan.step));
+        let mut parts = heads.nets.iter().zip(&mut heads.tables).zip(tables);
+        let streams = [(); 3].map(|()| {
+            let ((net, tables), states) = parts.next()?;
+            Some(StreamTables { encoding: &net.as_ref()?.grid, tables, states, rate })
+        });
+        groups.iter_mut().flat_map(|g| &mut g.batches).for_each(StreamBatch::put_off);
+        let batches = groups.iter_mut().flat_map(|g| g.batches.iter_mut().enumerate());
+        update_and_encode(streams, batches, scratch);
         let rate = StepSize::new(plan.network_rate, plan.step);
         for (s, (weights, moments)) in heads.weights.iter_mut().zip(moments).enumerate() {
             let mut gradient = vec![0.0; weights.len()];
-            for group in groups {
+            for group in &*groups {
                 gradient.iter_mut().zip(&group.gradient[s]).for_each(|(g, d)| *g += d);
             }
             adam::update(weights, &gradient, &mut moments.first, &mut moments.second, rate);

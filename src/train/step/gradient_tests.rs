@@ -168,8 +168,8 @@ impl WithSimd for ChunkPass<'_> {
         chunk.choose_rays(context, 0);
         chunk.place(context, &mut tracer, 0);
         for (s, batch) in chunk.traced.batches.iter_mut().enumerate() {
-            let net = context.model.field.nets[s].as_ref().expect("all streams are on");
-            net.encode(&context.model.weights(s).expect("all streams are on"), batch);
+            let field = context.model.field;
+            batch.encode(&field.nets[s].as_ref().expect("all streams are on").encoding, &field.tables[s]);
         }
         let loss = chunk.evaluate(simd, context, &mut tracer, &mut gradient, 0);
         chunk.backward(simd, context, &mut tracer, &gradient, dense);

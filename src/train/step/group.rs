@@ -100,6 +100,12 @@ impl Group {
         }
     }
 
+    /// Forgets all samples but for what was found out about the tables.
+    pub fn put_off(&mut self) {
+        self.chunks.iter_mut().for_each(TrainChunk::put_off);
+        self.refresh.iter_mut().for_each(|refresh| refresh.batch.clear());
+    }
+
     /// All samples that are evaluated, with the number of their stream.
     pub fn batches(&mut self) -> impl Iterator<Item = (usize, &mut StreamBatch)> {
         let chunks = self.chunks.iter_mut().flat_map(|c| c.traced.batches.iter_mut().enumerate());
@@ -244,6 +250,7 @@ impl TrainChunk {
     #[inline(always)]
     pub fn place(&mut self, context: &Context, tracer: &mut Tracer, number: usize) {
         let plan = context.plan;
+        self.put_off();
         self.traced.place(tracer, context.model, context.views, &self.inputs, &plan.sampling);
         let refine = plan.pose_rate > 0.0 || plan.rig_rate > 0.0;
         let slopes = refine && (number as u64 + plan.step).is_multiple_of(REFINE_EVERY);
@@ -251,6 +258,11 @@ impl TrainChunk {
         for (batch, slopes) in self.traced.batches.iter_mut().zip([slopes, slopes, false]) {
             batch.slopes = slopes;
         }
+    }
+
+    /// Leaves what was found out about the tables for later.
+    pub fn put_off(&mut self) {
+        self.traced.batches.iter_mut().for_each(StreamBatch::put_off);
     }
 
     /// Evaluates the streams and the loss of the chunk with number `number`.

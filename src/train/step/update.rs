@@ -1,7 +1,6 @@
-//! The end of a step: tables, density grids and dense weights take what the groups have found.
+//! The end of a step: density grids and dense weights take what the groups have found, tables when the next one begins.
 
 use std::ops::Range;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::{Optimiser, StepPlan};
 use crate::field::Field;
@@ -9,27 +8,12 @@ use crate::field::hashgrid::FEATURES;
 use crate::render::forward::Grids;
 use crate::tasks::Tasks;
 use crate::train::adam::{self, Moments, StepSize};
-use crate::train::table_pass::TablePass;
 
-/// Updates everything that is learned, and the density grids; returns the rows of tables that were updated.
-pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, plan: &StepPlan) -> usize {
-    let Optimiser { dense, tables, groups, gradient, table_scratch: scratch, .. } = optimiser;
-    let (groups, scratch) = (&groups[..], &*scratch);
-    let arch = pulp::Arch::new();
-    let rate = StepSize::new(plan.table_rate, plan.step);
-    let (mut tasks, updated) = (Tasks::default(), &AtomicUsize::new(0));
-    for (s, (tables, states)) in field.tables.iter_mut().zip(tables).enumerate() {
-        let (true, Some(net)) = (plan.streams[s], &field.nets[s]) else { continue };
-        let levels = net.encoding.levels.iter().enumerate();
-        for ((number, level), (table, state)) in levels.zip(tables.iter_mut().zip(states)) {
-            let chunks = groups.iter().flat_map(|g| &g.chunks);
-            let batches = chunks.map(move |chunk| &chunk.traced.batches[s]);
-            let pass = TablePass { batches, number, level, table, state, rate, scratch };
-            tasks.add(pass.cost(), move || {
-                updated.fetch_add(arch.dispatch(pass), Ordering::Relaxed);
-            });
-        }
-    }
+/// Updates dense weights and density grids.
+pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, plan: &StepPlan) {
+    let Optimiser { dense, groups, gradient, .. } = optimiser;
+    let groups = &groups[..];
+    let mut tasks = Tasks::default();
     for (s, grid) in grids.streams.iter_mut().enumerate().filter(|(s, _)| plan.streams[*s]) {
         let cells = groups.iter().map(|group| group.evaluations[s]).sum();
         tasks.add(cells, move || {
@@ -46,7 +30,6 @@ pub fn update(optimiser: &mut Optimiser, field: &mut Field, grids: &mut Grids, p
     });
     tasks.run();
     update_dense(field, dense, gradient, plan);
-    updated.load(Ordering::Relaxed)
 }
 
 fn update_dense(field: &mut Field, moments: &mut Moments, gradient: &[f32], plan: &StepPlan) {

@@ -26,6 +26,7 @@ const ILL_POSED: f64 = 0.1;
 impl Trainer {
     /// Registers all training frames to what the field shows from where they are.
     pub(super) fn align(&mut self) {
+        self.settle();
         let model = Model::new(&self.trained.field, &self.trained.grids, self.streams);
         let correction = align::align(&model, &self.pixels, &self.config.train.look_sampling());
         correction.apply(&mut self.trained.field);

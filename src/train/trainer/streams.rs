@@ -34,6 +34,7 @@ impl Trainer {
 
     /// Decides which streams the scene needs, once the persistent one has had its time alone.
     pub(super) fn settle_streams(&mut self) {
+        self.settle();
         if self.config.train.streams == StreamChoice::Auto {
             let unexplained = self.unexplained();
             self.trained.progress.unexplained = Some(unexplained);

@@ -4,7 +4,9 @@ use std::ops::ControlFlow;
 
 use super::*;
 use crate::field::{EncodingKind, FrequencyConfig};
+use crate::rng::Rng;
 use crate::synth::{SynthOptions, generate};
+use crate::train::step::CHUNK_RAYS;
 use crate::train::testing;
 
 /// Steps of the tests' schedules: two reports.
@@ -250,4 +252,37 @@ fn stereo_is_left_out_where_a_time_budget_is_too_short_for_it() {
         assert_eq!(found, !left_out, "{budget:?}, {cost} s, {moves}");
         assert_eq!(trainer.trained.progress.stereo_left_out, left_out.then_some(cost));
     }
+}
+
+#[test]
+fn tables_that_wait_for_the_next_step_learn_the_same() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = testing::scene(folder.path());
+    let learn = |take: fn(&mut Trainer, usize) -> Vec<StepReport>| {
+        let mut trainer = Trainer::new(&scene, &testing::config()).expect("the test's scene is valid");
+        trainer.streams = [true; 3];
+        let mut reports = take(&mut trainer, 5);
+        // Other groups of rays, which cannot tell what these have found.
+        trainer.config.train.rays += 20 * CHUNK_RAYS;
+        reports.extend(take(&mut trainer, 3));
+        trainer.settle();
+        let rows = reports.iter().map(|report| (report.loss, report.rows)).collect::<Vec<_>>();
+        (rows, trainer.trained.field.weights, trainer.trained.field.tables)
+    };
+    let at_once = |trainer: &mut Trainer, count| {
+        let one = |_| trainer.step(0.5, None).expect("the numbers stay finite");
+        (0..count).map(one).collect()
+    };
+    let waiting = |trainer: &mut Trainer, count| trainer.steps(0.5, count).expect("the numbers stay finite");
+    let never_settled = |trainer: &mut Trainer, count| {
+        let one = |_| trainer.begin_step(0.5, None).expect("the numbers stay finite");
+        (0..count).map(one).collect()
+    };
+    let (rows, weights, tables) = learn(at_once);
+    assert!(rows.iter().all(|(_, rows)| rows.updated > 0 && rows.unseen > 0), "{rows:?}");
+    assert!(learn(waiting) == (rows.clone(), weights.clone(), tables.clone()));
+    let (late, late_weights, late_tables) = learn(never_settled);
+    assert!((late_weights, late_tables) == (weights, tables));
+    // A step tells what became of the tables after the one before.
+    assert!(late[1..].iter().map(|(_, rows)| rows).eq(rows[..7].iter().map(|(_, rows)| rows)));
 }
