@@ -122,21 +122,34 @@ impl Trainer {
         field.weights[refinement].copy_from_slice(&now);
     }
 
-    /// Undoes the refinement of the poses if stereo finds less from them than from the poses as they were given; otherwise
-    /// the search that has told so goes on.
+    /// Undoes the refinement of the poses if stereo finds less from them than from the poses as they were given; the search
+    /// that goes on, which is none where poses have nothing to be compared with.
+    ///
+    /// Where poses are bad stereo finds little, and by chance: in a few frames less than before is no proof, and all of them
+    /// are asked.
     pub(super) fn settle_poses(&mut self) -> Option<Search> {
-        let given = self.trained.progress.given_coverage.filter(|_| !self.trained.progress.trusts_poses)?;
-        let judged = self.judged_frames(self.trained.progress.judged.unwrap_or(JUDGED_FRAMES[1]));
-        let Trained { field, progress, .. } = &mut self.trained;
-        let search = self.pixels.stereo_search(field, &self.config.stereo);
+        let progress = &self.trained.progress;
+        let given = progress.given_coverage.filter(|_| !progress.trusts_poses)?;
+        let judged = self.judged_frames(progress.judged.unwrap_or(JUDGED_FRAMES[1]));
+        let Self { trained: Trained { field, progress, .. }, pixels, config, .. } = self;
+        let search = pixels.stereo_search(field, &config.stereo);
         let refined = search.coverage(&judged);
         tracing::info!(given, refined, "depth by stereo from poses as given and as refined");
         if refined >= given {
             return Some(search);
         }
-        let refinement = field.layout.refinement();
-        field.weights[refinement].fill(0.0);
+        let refinement = &mut field.weights[field.layout.refinement()];
+        let weights = refinement.to_vec();
+        refinement.fill(0.0);
+        let as_given = pixels.stereo_search(field, &config.stereo);
+        let all: Vec<usize> = (0..pixels.frames.len()).collect();
+        let [given, refined] = [&as_given, &search].map(|search| search.coverage(&all));
+        tracing::info!(given, refined, "the same of all frames");
+        if refined >= given {
+            field.weights[field.layout.refinement()].copy_from_slice(&weights);
+            return Some(search);
+        }
         progress.trusts_poses = true;
-        None
+        Some(as_given)
     }
 }

@@ -169,16 +169,23 @@ fn resuming_gives_the_bytes_of_an_uninterrupted_training() {
 #[test]
 fn a_refinement_from_which_stereo_finds_less_is_undone() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let scene = testing::scene(folder.path());
-    let mut trainer = Trainer::new(&scene, &config(0.3)).expect("the test's scene is valid");
+    let options = SynthOptions { frames: 24, width: 96, height: 54, seed: 1 };
+    generate(&options, folder.path()).expect("the temporary folder can be written");
+    let scene = Scene::open(folder.path()).expect("it was just made");
+    let mut trainer = Trainer::new(&scene, &Config::default()).expect("the scene is valid");
     let refinement = trainer.trained.field.layout.refinement();
-    for (given, left) in [(0.0, 1e-3), (2.0, 0.0)] {
-        trainer.trained.field.weights[refinement.clone()].fill(1e-3);
+    let all: Vec<usize> = (0..trainer.pixels.frames.len()).collect();
+    // A few frames say yes; they say no, and all of them that nothing is lost; all of them say no.
+    for (given, moved, kept) in [(0.0, 0.05, true), (2.0, 1e-9, true), (2.0, 0.05, false)] {
+        let weights = testing::noise(&mut Rng::new(7, 0, 0), refinement.len(), moved);
+        trainer.trained.field.weights[refinement.clone()].copy_from_slice(&weights);
         trainer.trained.progress.given_coverage = Some(given);
-        let search = trainer.settle_poses();
-        assert_eq!(search.is_some(), left != 0.0);
-        assert_eq!(trainer.trained.progress.trusts_poses, left == 0.0);
-        assert!(trainer.trained.field.weights[refinement.clone()].iter().all(|w| *w == left));
+        let search = trainer.settle_poses().expect("the poses have been refined");
+        assert_eq!(trainer.trained.progress.trusts_poses, !kept, "{given} {moved}");
+        let left = &trainer.trained.field.weights[refinement.clone()];
+        assert!(if kept { *left == weights } else { left.iter().all(|w| *w == 0.0) });
+        let goes_on = trainer.pixels.stereo_search(&trainer.trained.field, &trainer.config.stereo);
+        assert_eq!(search.coverage(&all), goes_on.coverage(&all), "another search goes on");
     }
 }
 
