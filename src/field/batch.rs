@@ -122,8 +122,14 @@ impl StreamBatch {
     #[inline(always)]
     pub(super) fn retain(&mut self, keep: impl Fn(usize) -> bool, encoded: bool) {
         let Self { sample, ray, pos, levels, slopes, kept, .. } = self;
-        kept.clear();
-        kept.extend((0..sample.len() as u32).filter(|lane| keep(sample[*lane as usize] as usize)));
+        kept.resize(sample.len(), 0);
+        let mut count = 0;
+        for (lane, sample) in sample.iter().enumerate() {
+            // Whether one is kept is nothing that a processor could foresee.
+            kept[count] = lane as u32;
+            count += usize::from(keep(*sample as usize));
+        }
+        kept.truncate(count);
         let tiles = kept.len().div_ceil(TILE);
         for numbers in [sample, ray] {
             compact(numbers, kept);

@@ -80,10 +80,13 @@ impl<S: Simd> Floats<S> {
         high.where_greater(clamped, high, clamped)
     }
 
-    /// Without its sign.
+    /// Without its sign, which zeros keep.
+    ///
+    /// [`Simd::abs_f32s`] is not always inlined, and then compiled without the caller's vector features.
     #[inline(always)]
     pub fn abs(self) -> Self {
-        Self { values: self.simd.abs_f32s(self.values), ..self }
+        let zero = Self::new(self.simd, 0.0);
+        (zero - self).where_greater(zero, self, self)
     }
 
     /// Square root.

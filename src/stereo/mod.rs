@@ -26,6 +26,7 @@ use self::rig::WorkView;
 pub use self::see_through::{SeenFrame, seen_through};
 use crate::config::ConfigError;
 use crate::scene::Camera;
+use crate::simd::prefetch;
 
 /// Settings of the stereo depth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -111,6 +112,13 @@ impl StereoDepth {
     pub fn at(&self, dir: Vec3) -> Option<f32> {
         let depth = self.depth[self.seen(dir)?];
         (depth > 0.0).then_some(depth)
+    }
+
+    /// Asks for what [`Self::at`] says before it is needed.
+    pub fn fetch(&self, dir: Vec3) {
+        if let Some(pixel) = self.seen(dir) {
+            prefetch(&self.depth[pixel], 0);
+        }
     }
 
     /// Number of the pixel in the direction `dir` (camera axes) as a frame's own lens has it; `None` outside.

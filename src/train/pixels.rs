@@ -11,6 +11,7 @@ use crate::render::rays::{PixelDirections, View, pixel_directions};
 use crate::render::refined::refined_camera;
 use crate::rng::Rng;
 use crate::scene::{Camera, Frame, SceneError};
+use crate::simd::prefetch;
 use crate::stereo::{self, SeenFrame, StereoConfig, StereoDepth, StereoFrame};
 
 /// Frames with their pixels and the directions of their cameras' pixels.
@@ -63,6 +64,19 @@ impl PixelSet {
     /// Directions of all pixels of frame `n` in camera axes.
     pub fn directions(&self, n: usize) -> &[glam::Vec3] {
         &self.cameras[self.camera_of[n]].1
+    }
+
+    /// Asks for what [`Self::directions`] and images say about a pixel of frame `n` before it is needed.
+    pub fn fetch(&self, n: usize, pixel: usize) {
+        prefetch(&self.images[n][pixel], 0);
+        prefetch(&self.directions(n)[pixel], 0);
+    }
+
+    /// Asks for what [`Self::stereo_distance`] says about a pixel of frame `n`, after [`Self::fetch`].
+    pub fn fetch_depth(&self, n: usize, pixel: usize) {
+        if let Some(stereo) = self.stereo.get(n) {
+            stereo.fetch(self.directions(n)[pixel]);
+        }
     }
 
     /// A time near that of frame `n`: from half-way to the frame before it (`u` = 0) to half-way to the one after it

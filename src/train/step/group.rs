@@ -182,45 +182,48 @@ pub fn finish<S: Simd>(simd: S, context: &Context, tracer: &mut Tracer, dense: &
     }
 }
 
+/// Frame and pixel of each ray of a chunk, patch by patch.
+fn draw_patches(context: &Context, rng: &mut Rng) -> Vec<(usize, usize)> {
+    let (pixels, side) = (context.pixels, context.plan.patch);
+    let mut rays = Vec::with_capacity(CHUNK_RAYS);
+    while rays.len() < CHUNK_RAYS {
+        let (frame, middle) = pixels.draw(rng);
+        let stride = 1u32 << rng.below(PATCH_STRIDES);
+        let camera = &pixels.frames[frame].camera;
+        // A patch that sticks out is moved back into the picture, as far as it fits.
+        let along = |middle: u32, size: u32, n: u32| {
+            let start = middle.saturating_sub((side - 1) * stride / 2);
+            let start = start.min(size.saturating_sub((side - 1) * stride + 1));
+            (start + n * stride).min(size - 1)
+        };
+        let left = (CHUNK_RAYS - rays.len()).min((side * side) as usize) as u32;
+        rays.extend((0..left).map(|n| {
+            let x = along(middle as u32 % camera.width, camera.width, n % side);
+            let y = along(middle as u32 / camera.width, camera.height, n / side);
+            let pixel = x + y * camera.width;
+            (frame, if pixels.is_usable(frame, pixel) { pixel as usize } else { middle })
+        }));
+    }
+    rays
+}
+
 impl TrainChunk {
     pub fn choose_rays(&mut self, context: &Context, chunk: usize) {
         self.inputs.clear();
         self.targets.clear();
-        let pixels = context.pixels;
-        let side = context.plan.patch;
         let mut rng = Rng::new(context.seed, context.plan.step, chunk as u64);
-        let mut middle = (0, 0, 1);
-        let given = context.companion.map(|c| c.rays(chunk));
-        for k in 0..CHUNK_RAYS {
-            if let Some(rays) = &given {
-                let (frame, pixel) = rays[k];
-                self.add_ray(context, &mut rng, frame, pixel);
-                continue;
-            }
-            let in_patch = k as u32 % (side * side);
-            if in_patch == 0 {
-                let (frame, pixel) = pixels.draw(&mut rng);
-                middle = (frame, pixel, 1u32 << rng.below(PATCH_STRIDES));
-            }
-            let (frame, first, stride) = middle;
-            let camera = &pixels.frames[frame].camera;
-            // A patch that sticks out is moved back into the picture, as far as it fits.
-            let along = |middle: u32, size: u32, n: u32| {
-                let start = middle.saturating_sub((side - 1) * stride / 2);
-                let start = start.min(size.saturating_sub((side - 1) * stride + 1));
-                (start + n * stride).min(size - 1)
-            };
-            let x = along(first as u32 % camera.width, camera.width, in_patch % side);
-            let y = along(first as u32 / camera.width, camera.height, in_patch / side);
-            let pixel = match pixels.is_usable(frame, x + y * camera.width) {
-                true => (x + y * camera.width) as usize,
-                false => first,
-            };
+        let (rays, side) = match context.companion {
+            // Rays that somebody else has chosen are no patches.
+            Some(companion) => (companion.rays(chunk), 1),
+            None => (draw_patches(context, &mut rng), context.plan.patch as usize),
+        };
+        // They are all over the frames.
+        rays.iter().for_each(|(frame, pixel)| context.pixels.fetch(*frame, *pixel));
+        rays.iter().for_each(|(frame, pixel)| context.pixels.fetch_depth(*frame, *pixel));
+        for (frame, pixel) in rays {
             self.add_ray(context, &mut rng, frame, pixel);
         }
-        // Rays that somebody else has chosen are no patches.
-        let side = if given.is_some() { 1 } else { side };
-        flatness::find(&self.inputs, &self.targets, side as usize, &mut self.bends);
+        flatness::find(&self.inputs, &self.targets, side, &mut self.bends);
     }
 
     fn add_ray(&mut self, context: &Context, rng: &mut Rng, frame: usize, pixel: usize) {

@@ -1,9 +1,8 @@
 //! Loss and gradients of many seeds against f64: along the gradient of each kind of parameters, the loss must rise as
 //! fast as the gradient says.
 
-use super::gradient_tests::{Place, Traced, add, trace};
+use super::gradient_tests::{Place, RAYS, Traced, add, trace};
 use super::reference::{Numbers, Reference};
-use super::*;
 use crate::field::Stream;
 
 /// Seeds that are looked at.
@@ -55,7 +54,7 @@ fn loss_and_slopes_of_a_hundred_seeds_are_within_one_per_cent_of_f64() {
         let traced = trace(1000 + seed);
         let x = Numbers::of(&traced.field);
         traced.with_reference(|reference| {
-            let (loss, truth) = (traced.loss / CHUNK_RAYS as f64, reference.loss(&x));
+            let (loss, truth) = (traced.loss / RAYS as f64, reference.loss(&x));
             assert!((loss - truth).abs() <= RELATIVE * truth.abs(), "seed {seed}: loss {loss}, f64 {truth}");
             for (name, part) in parts(&traced) {
                 let norm = part.iter().map(|(_, _, g)| g * g).sum::<f64>().sqrt();

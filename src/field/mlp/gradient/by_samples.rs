@@ -15,6 +15,8 @@ pub type Block = [f32; BLOCK];
 #[inline(always)]
 pub fn accumulate<S: Simd>(simd: S, layers: &[Layer], strip: Strip, sums: &mut [f32]) {
     let count = strip.count;
+    // One for all: to make one for every product would take as long as a seventh of it.
+    let mut room = [[simd.splat_f32s(0.0); BLOCK]; 6];
     for layer in layers {
         let (weights, biases) = parts(sums, layer);
         let [x, dy] = strip.of(layer);
@@ -29,9 +31,9 @@ pub fn accumulate<S: Simd>(simd: S, layers: &[Layer], strip: Strip, sums: &mut [
             for (block, weights) in weights.chunks_exact_mut(layer.n_in).enumerate() {
                 let (dy, out) = (dy.rows(block * BLOCK), &mut weights[i..i + wide]);
                 match wide {
-                    6 => outer_product::<S, 6>(simd, dy, x, count, out),
-                    4 => outer_product::<S, 4>(simd, dy, x, count, out),
-                    _ => outer_product::<S, 2>(simd, dy, x, count, out),
+                    6 => outer_product::<S, 6>(simd, dy, x, count, &mut room, out),
+                    4 => outer_product::<S, 4>(simd, dy, x, count, &mut room, out),
+                    _ => outer_product::<S, 2>(simd, dy, x, count, &mut room, out),
                 }
             }
             i += wide;
@@ -66,23 +68,24 @@ pub fn unpack(layers: &[Layer], sums: &[f32], out: &mut [f32]) {
 }
 
 /// Adds Σ over samples of dy[j] x[k] to `out`, for four outputs and `WIDE` inputs: for half of the outputs at a time where registers
-/// are few.
+/// are few. In `room` are the sums of the lanes.
 #[inline(always)]
 fn outer_product<S: Simd, const WIDE: usize>(
     simd: S,
     dy: TileView,
     x: TileView,
     count: usize,
+    room: &mut [[S::f32s; BLOCK]],
     out: &mut [Block],
 ) {
-    let mut sums = [[simd.splat_f32s(0.0); BLOCK]; WIDE];
+    let Some(sums) = room.first_chunk_mut::<WIDE>() else { return };
     if S::REGISTER_COUNT < 32 {
-        outputs_by_inputs::<S, 2, WIDE>(simd, dy, x, count, 0, &mut sums);
-        outputs_by_inputs::<S, 2, WIDE>(simd, dy.rows(2), x, count, 2, &mut sums);
+        outputs_by_inputs::<S, 2, WIDE>(simd, dy, x, count, 0, sums);
+        outputs_by_inputs::<S, 2, WIDE>(simd, dy.rows(2), x, count, 2, sums);
     } else {
-        outputs_by_inputs::<S, BLOCK, WIDE>(simd, dy, x, count, 0, &mut sums);
+        outputs_by_inputs::<S, BLOCK, WIDE>(simd, dy, x, count, 0, sums);
     }
-    add_vectors::<S, _>(&sums, out);
+    add_vectors::<S, _>(sums, out);
 }
 
 /// Σ over samples of dy[j] x[k], but for the sum over lanes, as `out[k][first + j]`.

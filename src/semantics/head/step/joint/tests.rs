@@ -32,7 +32,7 @@ fn traced(frame: &Frame) -> (Field, Chunk) {
     let directions = pixel_directions(&frame.camera);
     let inputs: Vec<RayInput> = (0..CHUNK_RAYS)
         .map(|n| {
-            let pixel = 5 * n + 40;
+            let pixel = 2 * n + 40;
             let [x, y] = [pixel as u32 % frame.camera.width, pixel as u32 / frame.camera.width];
             let uv = glam::Vec2::new(x as f32 + 0.5, y as f32 + 0.5)
                 / glam::Vec2::new(frame.camera.width as f32, frame.camera.height as f32);
