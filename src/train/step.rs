@@ -146,14 +146,14 @@ pub struct Optimiser {
     pub tables: [Vec<TableState>; 3],
     groups: Vec<Group>,
     /// What a step has left to be done.
-    put_off: Option<PutOff>,
+    put_off: Option<TableUpdate>,
     scratch: PerThread<Scratch>,
     table_scratch: PerThread<TableScratch>,
     gradient: Vec<f32>,
 }
 
 /// An update of the tables by what the samples of all groups have found.
-struct PutOff {
+struct TableUpdate {
     rate: StepSize,
     streams: [bool; 3],
     /// How many chunks of rays they are of.
@@ -237,7 +237,7 @@ impl Optimiser {
         drop(model);
         field.tables = tables;
         let rate = StepSize::new(plan.table_rate, plan.step);
-        self.put_off = Some(PutOff { rate, streams: plan.streams, chunks });
+        self.put_off = Some(TableUpdate { rate, streams: plan.streams, chunks });
         let evaluated = Instant::now();
         let mut report = self.report(field, plan, rays);
         report.rows = settled.unwrap_or(rows);
@@ -288,9 +288,7 @@ impl Optimiser {
         let put_off = put_off.take();
         let rate = |s: usize| put_off.as_ref().filter(|p| p.streams[s]).map(|p| p.rate);
         let all: usize = (0..3).filter(|s| rate(*s).is_some()).flat_map(|s| &tables[s]).map(Vec::len).sum();
-        let mut parts = nets.iter().zip(tables).zip(states).enumerate();
-        let streams = [(); 3].map(|()| {
-            let (s, ((net, tables), states)) = parts.next()?;
+        let streams = nets.iter().zip(tables).zip(states).enumerate().map(|(s, ((net, tables), states))| {
             Some(StreamTables { encoding: &net.as_ref()?.encoding, tables, states, rate: rate(s) })
         });
         let updated = update_and_encode(streams, groups.iter_mut().flat_map(Group::batches), table_scratch);

@@ -32,26 +32,27 @@ pub struct StreamTables<'a> {
 }
 
 /// Updates tables by the gradients that batches have [put off](StreamBatch::put_off), and encodes the batches' samples, level by
-/// level; batches come with the number of their stream. Gives the rows that were updated, with those beside them on a cache line.
+/// level; batches come with the number of their stream, of those that are there. Gives the rows that were updated, with those beside
+/// them on a cache line.
 pub fn update_and_encode<'a>(
-    streams: [Option<StreamTables<'a>>; 3],
+    streams: impl Iterator<Item = Option<StreamTables<'a>>>,
     batches: impl Iterator<Item = (usize, &'a mut StreamBatch)>,
     scratch: &PerThread<TableScratch>,
 ) -> usize {
-    let mut levels: [Vec<LevelTask>; 3] = Default::default();
+    let mut streams: Vec<_> =
+        streams.map(|stream| stream.map(|stream| (stream, Vec::<LevelTask>::new()))).collect();
     for (s, batch) in batches {
-        let Some(StreamTables { encoding, .. }) = streams[s] else { continue };
+        let Some((StreamTables { encoding, .. }, levels)) = &mut streams[s] else { continue };
         let of_batch = batch.tasks(encoding);
-        if levels[s].is_empty() {
-            levels[s] = of_batch;
+        if levels.is_empty() {
+            *levels = of_batch;
         } else {
-            levels[s].iter_mut().zip(of_batch).for_each(|(task, of_batch)| task.append(of_batch));
+            levels.iter_mut().zip(of_batch).for_each(|(task, of_batch)| task.append(of_batch));
         }
     }
     let arch = pulp::Arch::new();
     let (mut tasks, updated) = (Tasks::default(), &AtomicUsize::new(0));
-    for (stream, levels) in streams.into_iter().zip(levels) {
-        let Some(StreamTables { tables, states, rate, .. }) = stream else { continue };
+    for (StreamTables { tables, states, rate, .. }, levels) in streams.into_iter().flatten() {
         for ((task, table), state) in levels.into_iter().zip(tables).zip(states) {
             let pass = TablePass { task, table, state, rate, scratch };
             tasks.add(pass.cost(), move || {

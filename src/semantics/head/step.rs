@@ -207,9 +207,7 @@ impl HeadOptimiser {
     fn update(&mut self, heads: &mut Heads, plan: &HeadStep) {
         let Self { moments, tables, groups, scratch } = self;
         let rate = Some(StepSize::new(plan.table_rate, plan.step));
-        let mut parts = heads.nets.iter().zip(&mut heads.tables).zip(tables);
-        let streams = [(); 3].map(|()| {
-            let ((net, tables), states) = parts.next()?;
+        let streams = heads.nets.iter().zip(&mut heads.tables).zip(tables).map(|((net, tables), states)| {
             Some(StreamTables { encoding: &net.as_ref()?.grid, tables, states, rate })
         });
         groups.iter_mut().flat_map(|g| &mut g.batches).for_each(StreamBatch::put_off);

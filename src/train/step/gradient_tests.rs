@@ -1,7 +1,6 @@
 //! Every gradient of a step against central differences of the f64 reference.
 
 use std::ops::Range;
-use std::panic::AssertUnwindSafe;
 
 use super::group::TrainChunk;
 use super::reference::{Numbers, Reference};
@@ -373,14 +372,11 @@ fn every_gradient_matches_finite_differences() {
 
 #[test]
 fn every_gradient_of_the_other_encodings_matches_finite_differences() {
-    // Where a sample is beside a face of a lattice or a kink of a network, f32 and f64 may have other slopes; a gradient that is
-    // wrong is wrong with all seeds.
-    let agrees = |encoding, seed| {
-        let traced = trace_with(seed, Setting { encoding, ..Setting::default() });
-        std::panic::catch_unwind(AssertUnwindSafe(|| check(&traced, seed))).is_ok()
-    };
-    for encoding in [EncodingKind::Dense, EncodingKind::Frequency] {
-        assert!(seeds().take(4).any(|seed| agrees(encoding, seed)), "{encoding:?}: no seed agrees");
+    // With the first two, a network on frequencies has a sample beside a kink, where f32 and f64 have other slopes.
+    for seed in seeds().skip(2).take(2) {
+        for encoding in [EncodingKind::Dense, EncodingKind::Frequency] {
+            check(&trace_with(seed, Setting { encoding, ..Setting::default() }), seed);
+        }
     }
 }
 
