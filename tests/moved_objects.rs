@@ -73,8 +73,7 @@ impl Found {
         assert!(*streams == [true; 3] && *unexplained > 0.06, "{streams:?} {unexplained}");
         assert!(*views >= 20, "{views} views are too few to tell");
         assert!(*right >= 0.6, "moved objects are found in {right:.2} of {views} views only");
-        // By chance the difference varies by 0.04: seeds of the rendered kitchen have 0.20 to 0.33.
-        assert!(*mirrored <= right - 0.15, "at another time as well ({mirrored:.2}): time does not count");
+        assert!(*mirrored <= right - 0.2, "at another time as well ({mirrored:.2}): time does not count");
     }
 }
 
@@ -99,7 +98,7 @@ fn on_the_synthetic_kitchen() {
 #[test]
 fn on_the_rendered_kitchen() {
     let Some(path) = data::scene("kitchen-a") else { return };
-    found(&path, &settings(2000)).check();
+    found(&path, &settings(2500)).check();
 }
 
 #[test]
