@@ -9,7 +9,9 @@ use std::mem::swap;
 
 use glam::{Vec3, Vec4};
 
-use crate::simd::{TILE, floor_within, prefetch};
+pub use crate::simd::rows::Slopes;
+use crate::simd::rows::{self, Corners};
+use crate::simd::{TILE, floor_within};
 
 /// Features per level: one 16-byte row.
 pub const FEATURES: usize = 4;
@@ -19,9 +21,6 @@ pub type Row = Vec4;
 
 /// Axes that lattices can span: three of space, and time.
 pub const AXES: usize = 4;
-
-/// Derivatives of a row of features by x, y and z.
-pub type Slopes = [Row; 3];
 
 /// The axis of time.
 pub const TIME: usize = 3;
@@ -46,15 +45,6 @@ pub struct Lattice {
     pub dense: bool,
 }
 
-/// The eight rows around each point of a tile and the points' places between them.
-#[derive(Clone)]
-struct Corners {
-    /// `[corner][lane]`, x fastest.
-    rows: [[u32; TILE]; 8],
-    /// `[axis][lane]`, 0–1.
-    frac: [[f32; TILE]; 3],
-}
-
 /// The corners around each point of a tile; for a lattice with time those before it and those after it.
 #[derive(Clone)]
 struct Cells {
@@ -69,8 +59,7 @@ pub struct Around([Cells; 2]);
 
 impl Default for Around {
     fn default() -> Self {
-        let corners = Corners { rows: [[0; TILE]; 8], frac: [[0.0; TILE]; 3] };
-        let none = Cells { before: corners.clone(), after: corners, fraction: [0.0; TILE] };
+        let none = Cells { before: Corners::default(), after: Corners::default(), fraction: [0.0; TILE] };
         Self([none.clone(), none])
     }
 }
@@ -229,14 +218,13 @@ impl Lattice {
         let mut walk = Walk::new(self, table, tiles, around);
         while let Some(out) = walk.advance() {
             let Walk { now, next, .. } = &walk;
-            for (s, out) in out.iter_mut().enumerate() {
-                next.before.fetch(table, s);
-                *out = now.before.interpolate(table, s).0;
-            }
+            rows::interpolate(table, &now.before, &next.before, out);
             if self.has_time() {
-                for (s, out) in out.iter_mut().enumerate() {
-                    next.after.fetch(table, s);
-                    *out += (now.after.interpolate(table, s).0 - *out) * now.fraction[s];
+                let mut after = [Row::ZERO; TILE];
+                let after = &mut after[..out.len()];
+                rows::interpolate(table, &now.after, &next.after, after);
+                for ((out, after), fraction) in out.iter_mut().zip(after).zip(&now.fraction) {
+                    *out += (*after - *out) * *fraction;
                 }
             }
         }
@@ -295,7 +283,7 @@ impl Lattice {
     #[inline(always)]
     fn corners(&self, pos: &Points, layer: &[u32; TILE], out: &mut Corners) {
         let mut cell = [[0u32; TILE]; 3];
-        let Corners { rows, frac } = out;
+        let Corners { rows, edges, frac } = out;
         for axis in 0..3 {
             let (scale, last) = (self.scale[axis], self.last_cell[axis] as f32);
             for s in 0..TILE {
@@ -307,23 +295,22 @@ impl Lattice {
             }
         }
         // Which of the two is asked here and not for each point: what a vector does or not by a mask is slow on many processors.
+        let [_, y, z, _] = self.stride;
+        *edges = self.dense.then(|| [0, y, z, y + z]);
         if self.dense {
-            self.dense_rows(&cell, layer, rows);
+            self.first_rows(&cell, layer, &mut rows[0]);
         } else {
             self.hashed_rows(&cell, layer, rows);
         }
     }
 
-    /// Rows around cells of a lattice that has one for each of its points.
+    /// Rows of the first corners of cells of a lattice that has one for each of its points.
     #[inline(always)]
-    fn dense_rows(&self, cell: &[[u32; TILE]; 3], layer: &[u32; TILE], rows: &mut [[u32; TILE]; 8]) {
+    fn first_rows(&self, cell: &[[u32; TILE]; 3], layer: &[u32; TILE], rows: &mut [u32; TILE]) {
         let [_, stride_y, stride_z, _] = self.stride;
         for s in 0..TILE {
             let [y, z] = [cell[1][s].wrapping_mul(stride_y), cell[2][s].wrapping_mul(stride_z)];
-            let first = cell[0][s].wrapping_add(y).wrapping_add(z).wrapping_add(layer[s]);
-            for n in 0..8 {
-                rows[n as usize][s] = first + (n & 1) + (n >> 1 & 1) * stride_y + (n >> 2) * stride_z;
-            }
+            rows[s] = cell[0][s].wrapping_add(y).wrapping_add(z).wrapping_add(layer[s]);
         }
     }
 
@@ -358,54 +345,21 @@ impl Lattice {
         while let Some(g) = walk.advance() {
             let Walk { now: Cells { before, after, fraction }, next, .. } = &walk;
             if self.has_time() {
-                before.scatter(grads, g, |s| 1.0 - fraction[s], &next.before);
-                after.scatter(grads, g, |s| fraction[s], &next.after);
+                let mut shares = [[0.0; TILE]; 2];
+                for s in 0..TILE {
+                    (shares[0][s], shares[1][s]) = (1.0 - fraction[s], fraction[s]);
+                }
+                let mut parts = [Row::ZERO; TILE];
+                let parts = &mut parts[..g.len()];
+                for (share, corners, next) in
+                    [(&shares[0], before, &next.before), (&shares[1], after, &next.after)]
+                {
+                    parts.iter_mut().zip(g).zip(share).for_each(|((part, g), share)| *part = *g * *share);
+                    rows::scatter(grads, corners, next, parts);
+                }
             } else {
-                before.scatter(grads, g, |_| 1.0, &next.before);
+                rows::scatter(grads, before, &next.before, g);
             }
         }
-    }
-}
-
-impl Corners {
-    /// Asks for the rows around the point of lane `s` before they are needed.
-    #[inline(always)]
-    fn fetch(&self, table: &[Row], s: usize) {
-        if let Some(first) = table.first() {
-            for rows in &self.rows {
-                prefetch(first, rows[s] as usize * size_of::<Row>());
-            }
-        }
-    }
-
-    /// Adds `g`, times `share` of its lane, to the rows by the weights with which they are read, and asks for those of `next`.
-    #[inline(always)]
-    fn scatter(&self, grads: &mut [Row], g: &[Row], share: impl Fn(usize) -> f32, next: &Self) {
-        for (s, g) in g.iter().enumerate() {
-            next.fetch(grads, s);
-            let g = *g * share(s);
-            let (fx, fy, fz) = (self.frac[0][s], self.frac[1][s], self.frac[2][s]);
-            let (g1, g0) = (g * fz, g * (1.0 - fz));
-            let (g11, g10, g01, g00) = (g1 * fy, g0 * fy, g1 * (1.0 - fy), g0 * (1.0 - fy));
-            for (n, g) in [g00, g10, g01, g11].into_iter().enumerate() {
-                grads[self.rows[2 * n][s] as usize] += g * (1.0 - fx);
-                grads[self.rows[2 * n + 1][s] as usize] += g * fx;
-            }
-        }
-    }
-
-    /// Features of lane `s`, and their derivatives by its three fractions.
-    #[inline(always)]
-    fn interpolate(&self, table: &[Row], s: usize) -> (Row, Slopes) {
-        let row = |n: usize| table[self.rows[n][s] as usize];
-        let [fx, fy, fz] = [self.frac[0][s], self.frac[1][s], self.frac[2][s]];
-        // By x along four edges, by y across two faces, by z through the cell.
-        let (r0, r2, r4, r6) = (row(0), row(2), row(4), row(6));
-        let (d0, d2, d4, d6) = (row(1) - r0, row(3) - r2, row(5) - r4, row(7) - r6);
-        let (a, b, c, d) = (r0 + d0 * fx, r2 + d2 * fx, r4 + d4 * fx, r6 + d6 * fx);
-        let (e, f) = (a + (b - a) * fy, c + (d - c) * fy);
-        let (xe, xf) = (d0 + (d2 - d0) * fy, d4 + (d6 - d4) * fy);
-        let by_y = (b - a) + ((d - c) - (b - a)) * fz;
-        (e + (f - e) * fz, [xe + (xf - xe) * fz, by_y, f - e])
     }
 }

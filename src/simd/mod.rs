@@ -9,6 +9,7 @@ pub mod floats;
 pub mod lanes;
 mod machine;
 pub mod matrix;
+pub mod rows;
 
 pub use machine::{
     Finish, Product, add_sums, columns, fours_of_rows, multiply, prefetch, prefetch_rows, rows_of_fours,

@@ -70,7 +70,7 @@ impl TableState {
     }
 
     /// Updates what has a gradient in this step and clears the gradients; returns the rows of all cache lines that hold any, and which
-    /// alone are read and written.
+    /// alone are read and written. `seen` is room for the numbers of those lines.
     ///
     /// Numbers without a gradient keep their moments: they were not seen, which is no evidence.
     #[inline(always)]
@@ -80,26 +80,24 @@ impl TableState {
         table: &mut [Row],
         gradient: &mut [Row],
         step: StepSize,
+        seen: &mut Vec<u32>,
     ) -> usize {
         let columns = [table, gradient, &mut self.first, &mut self.second];
         let [w, g, m, v] = columns.map(bytemuck::cast_slice_mut::<Row, f32>);
-        let (mut seen, mut updated) = (0u32, 0);
-        // Lines that are far apart are none that the processor foresees.
-        for ahead in 0..g.len().div_ceil(LINE) + AHEAD {
-            seen <<= 1;
-            if has_gradient(&g[g.len().min(ahead * LINE)..]) {
-                seen |= 1;
-                for column in [&*w, &*m, &*v] {
-                    prefetch(&column[ahead * LINE], 0);
+        find_seen(g, seen);
+        let mut updated = 0;
+        for (n, line) in seen.iter().enumerate() {
+            // Lines that are far apart are none that the processor foresees.
+            if let Some(ahead) = seen.get(n + AHEAD) {
+                for column in [&*w, &*g, &*m, &*v] {
+                    prefetch(&column[*ahead as usize * LINE], 0);
                 }
             }
-            if seen & 1 << AHEAD != 0 {
-                let line = (ahead - AHEAD) * LINE..g.len().min((ahead - AHEAD + 1) * LINE);
-                updated += line.len();
-                let of_line =
-                    [&mut w[line.clone()], &mut g[line.clone()], &mut m[line.clone()], &mut v[line]];
-                update_seen(simd, of_line, step);
-            }
+            let start = *line as usize * LINE;
+            let line = start..g.len().min(start + LINE);
+            updated += line.len();
+            let of_line = [&mut w[line.clone()], &mut g[line.clone()], &mut m[line.clone()], &mut v[line]];
+            update_seen(simd, of_line, step);
         }
         updated / FEATURES
     }
@@ -108,14 +106,25 @@ impl TableState {
 /// Numbers of a cache line.
 const LINE: usize = 16;
 
-/// Lines from one that is updated to the one that is asked for.
-const AHEAD: usize = 12;
+/// Lines that are seen from one that is updated to the one that is asked for.
+const AHEAD: usize = 8;
 
-/// Whether one of the first numbers, as many as a cache line holds, is not zero.
+/// Makes `seen` the numbers of the cache lines that have a number that is not zero.
 #[inline(always)]
-fn has_gradient(gradient: &[f32]) -> bool {
-    let Some(line) = gradient.first_chunk::<LINE>() else { return !gradient.is_empty() };
-    line.iter().fold(false, |any, g| any | (*g != 0.0))
+fn find_seen(gradient: &[f32], seen: &mut Vec<u32>) {
+    seen.resize(gradient.len().div_ceil(LINE), 0);
+    let (lines, rest) = gradient.as_chunks::<LINE>();
+    let mut count = 0;
+    for (number, line) in lines.iter().enumerate() {
+        // Whether one is seen is nothing that a processor could foresee.
+        seen[count] = number as u32;
+        count += usize::from(line.iter().fold(false, |any, g| any | (*g != 0.0)));
+    }
+    if !rest.is_empty() {
+        seen[count] = lines.len() as u32;
+        count += 1;
+    }
+    seen.truncate(count);
 }
 
 /// Updates the numbers that have a gradient and clears the gradients, of values, gradients and both moments.
@@ -171,7 +180,7 @@ mod tests {
         gradient[6].y = 0.0;
         let (mut all, mut all_table, mut all_gradient) = (state.clone(), table.clone(), gradient.clone());
         let step = StepSize::new(0.01, 5);
-        let updated = state.update(Scalar::new(), &mut table, &mut gradient, step);
+        let updated = state.update(Scalar::new(), &mut table, &mut gradient, step, &mut Vec::new());
         let [w, g, m, v] = [&mut all_table, &mut all_gradient, &mut all.first, &mut all.second]
             .map(|rows| bytemuck::cast_slice_mut(rows));
         update_seen(Scalar::new(), [w, g, m, v], step);
@@ -186,7 +195,13 @@ mod tests {
         let mut table = vec![Row::ONE; 8];
         let mut gradient = vec![Row::ZERO; 8];
         gradient[5].z = f32::NAN;
-        TableState::new(8).update(Scalar::new(), &mut table, &mut gradient, StepSize::new(0.01, 1));
+        TableState::new(8).update(
+            Scalar::new(),
+            &mut table,
+            &mut gradient,
+            StepSize::new(0.01, 1),
+            &mut Vec::new(),
+        );
         assert!(table[5].z.is_nan() && table[5].x == 1.0 && table[0] == Row::ONE);
     }
 }

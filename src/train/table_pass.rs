@@ -16,6 +16,8 @@ use crate::tasks::{PerThread, Tasks};
 pub struct TableScratch {
     /// Gradients of the rows of the table that the thread is at; zeros between tables.
     gradient: Vec<Row>,
+    /// Cache lines of those that are not zeros.
+    seen: Vec<u32>,
     around: Around,
 }
 
@@ -86,15 +88,16 @@ impl WithSimd for TablePass<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> usize {
         let Self { task, table, state, rate, scratch } = self;
-        let TableScratch { gradient, around } = &mut *scratch.mine();
-        let updated = rate.map_or(0, |rate| {
+        let TableScratch { gradient, seen, around } = &mut *scratch.mine();
+        let mut updated = 0;
+        if let Some(rate) = rate {
             if gradient.len() < table.len() {
                 gradient.resize(table.len(), Row::ZERO);
             }
             let gradient = &mut gradient[..table.len()];
             task.scatter(gradient, around);
-            state.update(simd, table, gradient, rate)
-        });
+            updated = state.update(simd, table, gradient, rate, seen);
+        }
         task.encode(table, around);
         updated
     }

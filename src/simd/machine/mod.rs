@@ -9,10 +9,13 @@ pub mod dots;
 mod lanes;
 #[cfg(target_arch = "x86_64")]
 mod products;
+#[cfg(target_arch = "x86_64")]
+mod rows;
 
 use glam::Vec4;
 
 use super::lanes::Layout;
+use super::rows::Corners;
 use super::{TILE, transposed};
 
 /// Asks for the cache line `bytes` behind `value` before it is needed; on other processors than x86-64, their own
@@ -181,6 +184,35 @@ pub fn keep_lanes(values: &mut [f32], layout: Layout, kept: &[u32], first: usize
     }
     #[cfg(not(target_arch = "x86_64"))]
     let _ = (values, layout, kept, first);
+    false
+}
+
+/// As [`super::rows::interpolate`], with the rows around `ahead` asked for; false, and nothing is done, where there are no instructions
+/// for it.
+#[inline(always)]
+pub fn interpolate(table: &[Vec4], corners: &Corners, ahead: Option<&Corners>, out: &mut [Vec4]) -> bool {
+    assert!(out.len() <= TILE && (out.is_empty() || corners.last_row(out.len()) < table.len()));
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx") {
+        // SAFETY: this processor has the instructions, and the table the rows.
+        unsafe { rows::interpolate(table, corners, ahead, out) };
+        return true;
+    }
+    let _ = ahead;
+    false
+}
+
+/// As [`super::rows::scatter`], likewise.
+#[inline(always)]
+pub fn scatter(table: &mut [Vec4], corners: &Corners, ahead: Option<&Corners>, g: &[Vec4]) -> bool {
+    assert!(g.len() <= TILE && (g.is_empty() || corners.last_row(g.len()) < table.len()));
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx") {
+        // SAFETY: this processor has the instructions, and the table the rows.
+        unsafe { rows::scatter(table, corners, ahead, g) };
+        return true;
+    }
+    let _ = ahead;
     false
 }
 
