@@ -53,10 +53,11 @@ impl Work {
             let Some(net) = net else { continue };
             let (all, faint) = (report.evaluations[s] as f64, report.faint[s] as f64);
             let (kept, refreshed) = (all - faint, report.refreshed[s] as f64);
-            let [whole, density] =
-                [net.trunk.multiply_adds() + net.head.multiply_adds(), density(&net.trunk)];
-            // Backward, the gradients of inputs and of weights take as much as forward each.
-            self.flops += 2.0 * ((faint + refreshed) * density as f64 + 3.0 * kept * whole as f64);
+            let nets = [&net.trunk, &net.head];
+            let both_ways: usize =
+                nets.iter().map(|net| net.multiply_adds() + net.multiply_adds_backward()).sum();
+            let density = density(&net.trunk);
+            self.flops += 2.0 * ((faint + refreshed) * density as f64 + kept * both_ways as f64);
             for (level, table) in net.encoding.levels.iter().zip(&field.tables[s]) {
                 let corners = level.corners() as f64;
                 let [read, added] = self.rows.entry(table.len()).or_default();

@@ -321,3 +321,28 @@ fn bf16_instructions_match_plain_loops() {
         }
     }
 }
+
+#[test]
+fn inputs_that_nobody_asks_about_change_nothing_else() {
+    for given in [3, 24, 40] {
+        for arithmetic in [Arithmetic::Single, Arithmetic::Rounded, Arithmetic::Matrix] {
+            let all = Case::new((&[40, 64, 4], None), given as u64);
+            let part = Case { net: all.net.clone().with_given(given), ..all.tile(0) };
+            let all = all.tile(0);
+            let [all_out, part_out] =
+                [&all, &part].map(|case| pulp::Arch::new().dispatch(Pass(case, arithmetic, Unit::Portable)));
+            assert_eq!((&part_out.values, &part_out.params), (&all_out.values, &all_out.params));
+            let asked = (40 - given).next_multiple_of(4) * TILE;
+            let tiles = all_out.gradients.chunks(40 * TILE);
+            let expected: Vec<f32> = tiles.flat_map(|tile| &tile[..asked]).copied().collect();
+            assert_eq!(part_out.gradients, expected);
+        }
+    }
+}
+
+#[test]
+fn the_way_back_takes_twice_as_much_but_for_what_nobody_asks_about() {
+    let net = Mlp::new(&[40, 64, 4]);
+    assert_eq!(net.multiply_adds_backward(), 2 * net.multiply_adds());
+    assert_eq!(net.with_given(24).multiply_adds_backward(), 64 * (2 * 40 + 2 * 4 - 24));
+}

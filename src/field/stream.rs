@@ -111,7 +111,7 @@ impl StreamNet {
         trunk.extend(std::iter::repeat_n(widths.hidden, widths.layers));
         trunk.push(widths.geometry);
         let trunk = Mlp::with_skip(&trunk, widths.skip);
-        let head = Mlp::new(&[trunk.output() + view, widths.head, 4]);
+        let head = Mlp::new(&[trunk.output() + view, widths.head, 4]).with_given(view);
         Self { encoding, trunk, head, code, view, density_bias: bias }
     }
 

@@ -84,6 +84,8 @@ pub struct Mlp {
     /// Widths: input, hidden ..., output. All multiples of 4.
     widths: Vec<usize>,
     layers: Vec<Layer>,
+    /// Rows of the input from the first on whose gradient is asked for.
+    asked: usize,
 }
 
 impl Mlp {
@@ -108,7 +110,17 @@ impl Mlp {
             at.bias += w[1];
             layer
         });
-        Self { layers: layers.collect(), widths }
+        Self { layers: layers.collect(), asked: widths[0], widths }
+    }
+
+    /// The same network, of whose inputs the last `given` have nothing that could learn: nobody asks for their gradient, and it need not
+    /// be computed.
+    pub fn with_given(self, given: usize) -> Self {
+        assert!(
+            self.layers.iter().all(|layer| layer.again == 0),
+            "an input that is seen twice learns as a whole"
+        );
+        Self { asked: (self.widths[0] - given).next_multiple_of(BLOCK), ..self }
     }
 
     /// Widths of input, hidden layers and output, as rounded up.
@@ -151,6 +163,12 @@ impl Mlp {
         self.layers.iter().map(|l| l.weights()).sum()
     }
 
+    /// Multiply-adds of one sample's way back: the gradients of all inputs that are asked for, and of the weights.
+    pub fn multiply_adds_backward(&self) -> usize {
+        let given = self.layers.first().map_or(0, |first| (self.widths[0] - self.asked) * first.n_out);
+        2 * self.multiply_adds() - given
+    }
+
     /// Kaiming-uniform weights and zero biases, from a stream of uniform numbers in [0, 1).
     pub fn init(&self, mut uniform: impl FnMut() -> f32) -> Vec<f32> {
         let mut params = Vec::with_capacity(self.parameters());
@@ -178,7 +196,7 @@ impl Mlp {
 
     /// Makes room for the activations of `tiles` tiles.
     pub fn reserve(&self, packed: &Packed, tiles: usize, a: &mut Activations) {
-        (a.input, a.output) = (self.input() * TILE, self.output() * TILE);
+        (a.input, a.asked, a.output) = (self.input() * TILE, self.asked * TILE, self.output() * TILE);
         a.rounded = matches!(packed, Packed::Rounded(_));
         let floats = match packed {
             Packed::Vector(_) => {
@@ -269,12 +287,14 @@ impl Mlp {
         }
         let (tile, grad) = (&a.values[at * a.stride..], &mut a.grads[a.waiting * a.stride..][..a.end]);
         match packed {
-            Packed::Vector(packed) => packed.backward(simd, &self.layers, &tile[..a.end], grad, ahead),
+            Packed::Vector(packed) => {
+                packed.backward(simd, &self.layers, &tile[..a.end], grad, self.asked, ahead);
+            }
             Packed::Rounded(packed) => {
                 let (tile, grad) = (cast_slice(&tile[..a.end]), cast_slice_mut(grad));
                 let (output, inputs) = a.row_grads.split_at_mut(a.output);
                 let (input, again) = inputs[..2 * a.input].split_at_mut(a.input);
-                packed.backward(&self.layers, tile, grad, output, [input, again], ahead);
+                packed.backward(&self.layers, tile, grad, output, [&mut input[..a.asked], again], ahead);
             }
             Packed::Matrix(packed) => {
                 packed.backward(unit, &self.layers, grad, &mut a.saved, n);
@@ -389,8 +409,9 @@ pub struct Activations {
     latest: usize,
     /// The parameters' gradients.
     sums: Sums,
-    /// Floats of a tile's input and output.
+    /// Floats of a tile's input, of what is asked of its gradient, and of the output.
     input: usize,
+    asked: usize,
     output: usize,
     saved: matrix::Saved,
     /// Whether all but the outputs of tiles is rounded to bf16, in pairs of rows.
@@ -425,13 +446,13 @@ impl Activations {
         &mut self.grads[self.waiting * self.stride + self.end - self.output..][..self.output]
     }
 
-    /// Gradient of the input rows of the tile that went backward last.
+    /// Gradient of the input rows of the tile that went backward last, as many as are [asked for](Mlp::with_given).
     #[inline(always)]
     pub fn input_grad(&self) -> &[f32] {
         if self.rounded {
-            return &self.row_grads[self.output..][..self.input];
+            return &self.row_grads[self.output..][..self.asked];
         }
-        &self.grads[self.latest * self.stride..][..self.input]
+        &self.grads[self.latest * self.stride..][..self.asked]
     }
 
     /// Floats from tile number `at` of those kept to the one behind it, if there is room for one.

@@ -63,8 +63,8 @@ impl Packed {
         }
     }
 
-    /// From the gradient of a tile's `output` rows to that of its `input` rows, and to all of `grad` but the input's place. Meanwhile the
-    /// tile `ahead` pairs behind `tile` may be asked for. In `again` is room for as much as `input` has.
+    /// From the gradient of a tile's `output` rows to that of the first of its `input` rows, as many as there are, and to all of `grad` but
+    /// the input's place. Meanwhile the tile `ahead` pairs behind `tile` may be asked for. In `again` is room for the whole input.
     #[inline(always)]
     pub(super) fn backward(
         &self,
@@ -81,7 +81,9 @@ impl Packed {
             let (dx, dy) = grad[pairs(layer.row)..].split_at_mut(pairs(layer.n_in));
             let w = &self.backward[layer.weight / 2..][..layer.weights() / 2];
             let (w, w_again) = w.split_at(layer.fresh() * layer.n_out / 2);
-            let x = &tile[pairs(layer.row)..][..pairs(layer.fresh())];
+            let rows = if n > 0 { layer.fresh() } else { input.len() / TILE };
+            let w = &w[..rows * layer.n_out / 2];
+            let x = &tile[pairs(layer.row)..][..pairs(rows)];
             let product = Product {
                 w,
                 bias: &[],

@@ -60,8 +60,8 @@ impl Packed {
         }
     }
 
-    /// Fills the gradient rows of one tile above the output, whose rows the caller has set. Meanwhile the tile `ahead` floats behind
-    /// `tile` may be asked for.
+    /// Fills the gradient rows of one tile above the output, whose rows the caller has set; of the input's the first `asked`, unless a
+    /// layer sees it again. Meanwhile the tile `ahead` floats behind `tile` may be asked for.
     #[inline(always)]
     pub(super) fn backward<S: Simd>(
         &self,
@@ -69,6 +69,7 @@ impl Packed {
         layers: &[Layer],
         tile: &[f32],
         grad: &mut [f32],
+        asked: usize,
         ahead: usize,
     ) {
         for (n, layer) in layers.iter().enumerate().rev() {
@@ -76,8 +77,10 @@ impl Packed {
             let w = &self.backward[layer.weight..][..layer.weights()];
             let (fresh, again) = dx.split_at_mut(layer.fresh() * TILE);
             let (w, w_again) = w.split_at(layer.fresh() * layer.n_out);
+            let rows = if n > 0 { layer.fresh() } else { asked };
+            let (w, fresh) = (&w[..rows * layer.n_out], &mut fresh[..rows * TILE]);
             let dy = &dy[..layer.n_out * TILE];
-            let x = &tile[layer.row * TILE..][..layer.fresh() * TILE];
+            let x = &tile[layer.row * TILE..][..rows * TILE];
             let finish = if n > 0 { Finish::Where(x) } else { Finish::Plain };
             let product = Product { w, bias: &[], x: dy, finish, ahead: x.as_ptr().wrapping_add(ahead) };
             matmul(simd, product, fresh);

@@ -54,7 +54,10 @@ impl Autoencoder {
             let all: Vec<usize> = [vec![ends[0]], hidden, vec![ends[1]]].concat();
             Mlp::new(&all)
         };
+        // Descriptors are what they are.
         let encoder = widths([full, dim], hidden.to_vec());
+        let given = encoder.input();
+        let encoder = encoder.with_given(given);
         let decoder = widths([dim, full], hidden.iter().rev().copied().collect());
         Self { full, dim, encoder, decoder, mean: vec![0.0; full], weights: Vec::new() }
     }

@@ -125,10 +125,11 @@ impl HeadShape {
 
     fn net(&self, stream: Stream) -> HeadNet {
         let grid = self.grid(stream);
-        let mut widths = vec![grid.width() + if self.scales.is_some() { FEATURES } else { 0 }];
+        let scale = if self.scales.is_some() { FEATURES } else { 0 };
+        let mut widths = vec![grid.width() + scale];
         widths.extend(std::iter::repeat_n(self.hidden, self.layers));
         widths.push(self.width());
-        HeadNet { mlp: Mlp::new(&widths), grid }
+        HeadNet { mlp: Mlp::new(&widths).with_given(scale), grid }
     }
 }
 
