@@ -18,8 +18,8 @@ const NEAR: usize = 16_384;
 pub struct Corners {
     /// Numbers of the rows, `[corner][lane]`; with `edges` of the first corner alone.
     pub rows: [[u32; TILE]; 8],
-    /// Of cells that are alike, how far from the first corner's row those of the four corners with the smaller x are; the other four
-    /// are one behind each.
+    /// Where the rows of all cells stand alike: how far from the first corner's those of the four corners with the smaller x are; those
+    /// of the other four are one behind each.
     pub edges: Option<[u32; 4]>,
     /// Where the points are between the corners, `[axis][lane]`, 0–1.
     pub frac: [[f32; TILE]; 3],
