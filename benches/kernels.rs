@@ -144,8 +144,8 @@ impl WithSimd for TablePass<'_> {
             Table::Scatter(table, g) => {
                 level.scatter(table, points.iter().zip(g.chunks(TILE)), &mut Around::default())
             }
-            Table::Update(state, table, gradient, seen) => {
-                state.update(simd, table, gradient, StepSize::new(1e-3, 10), seen);
+            Table::Update(state, table, gradient, lines) => {
+                state.update(simd, table, gradient, StepSize::new(1e-3, 10), lines);
             }
         }
     }
@@ -170,7 +170,7 @@ fn tables(c: &mut Criterion) {
     }
     let mut table = vec![Row::splat(0.1); level.rows];
     let mut state = TableState::new(level.rows);
-    let (mut gradient, mut seen) = (vec![Row::ZERO; level.rows], Vec::new());
+    let (mut gradient, mut lines) = (vec![Row::ZERO; level.rows], Vec::new());
     let mut rows = vec![Row::ONE; points.len() * TILE];
     let lookups = 8.0 * (points.len() * TILE) as f64;
     let mut group = c.benchmark_group("table");
@@ -197,7 +197,7 @@ fn tables(c: &mut Criterion) {
             pulp::Arch::new().dispatch(TablePass(
                 level,
                 &[],
-                Table::Update(&mut state, &mut table, &mut gradient, &mut seen),
+                Table::Update(&mut state, &mut table, &mut gradient, &mut lines),
             ));
         });
     });

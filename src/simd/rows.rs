@@ -42,14 +42,15 @@ impl Corners {
         number as usize
     }
 
-    /// The largest number of a row around the first points.
+    /// Whether a table of `rows` rows has all of those around the first points.
     #[inline(always)]
-    pub(super) fn last_row(&self, points: usize) -> usize {
+    pub(super) fn are_within(&self, points: usize, rows: usize) -> bool {
         let largest = |corner: usize| self.rows[corner][..points].iter().fold(0, |most, row| *row.max(&most));
-        match self.edges {
+        let last = match self.edges {
             Some(edges) => largest(0) as usize + edges.into_iter().fold(0, u32::max) as usize + 1,
             None => (0..8).map(largest).fold(0, u32::max) as usize,
-        }
+        };
+        points == 0 || last < rows
     }
 
     /// Asks for the rows around the point of lane `lane` before they are needed.

@@ -70,7 +70,7 @@ impl TableState {
     }
 
     /// Updates what has a gradient in this step and clears the gradients; returns the rows of all cache lines that hold any, and which
-    /// alone are read and written. `seen` is room for the numbers of those lines.
+    /// alone are read and written. In `room` their numbers are noted.
     ///
     /// Numbers without a gradient keep their moments: they were not seen, which is no evidence.
     #[inline(always)]
@@ -80,11 +80,11 @@ impl TableState {
         table: &mut [Row],
         gradient: &mut [Row],
         step: StepSize,
-        seen: &mut Vec<u32>,
+        room: &mut Vec<u32>,
     ) -> usize {
         let columns = [table, gradient, &mut self.first, &mut self.second];
         let [w, g, m, v] = columns.map(bytemuck::cast_slice_mut::<Row, f32>);
-        find_seen(g, seen);
+        let seen = seen_lines(g, room);
         let mut updated = 0;
         for (n, line) in seen.iter().enumerate() {
             // Lines that are far apart are none that the processor foresees.
@@ -109,22 +109,22 @@ const LINE: usize = 16;
 /// Lines that are seen from one that is updated to the one that is asked for.
 const AHEAD: usize = 8;
 
-/// Makes `seen` the numbers of the cache lines that have a number that is not zero.
+/// The numbers of the cache lines that have a number that is not zero, and of the last if it is not whole.
 #[inline(always)]
-fn find_seen(gradient: &[f32], seen: &mut Vec<u32>) {
-    seen.resize(gradient.len().div_ceil(LINE), 0);
+fn seen_lines<'a>(gradient: &[f32], room: &'a mut Vec<u32>) -> &'a [u32] {
     let (lines, rest) = gradient.as_chunks::<LINE>();
+    // What an earlier, larger table has left behind is of no one's concern.
+    if room.len() <= lines.len() {
+        room.resize(lines.len() + 1, 0);
+    }
     let mut count = 0;
     for (number, line) in lines.iter().enumerate() {
         // Whether one is seen is nothing that a processor could foresee.
-        seen[count] = number as u32;
+        room[count] = number as u32;
         count += usize::from(line.iter().fold(false, |any, g| any | (*g != 0.0)));
     }
-    if !rest.is_empty() {
-        seen[count] = lines.len() as u32;
-        count += 1;
-    }
-    seen.truncate(count);
+    room[count] = lines.len() as u32;
+    &room[..count + usize::from(!rest.is_empty())]
 }
 
 /// Updates the numbers that have a gradient and clears the gradients, of values, gradients and both moments.

@@ -16,8 +16,8 @@ use crate::tasks::{PerThread, Tasks};
 pub struct TableScratch {
     /// Gradients of the rows of the table that the thread is at; zeros between tables.
     gradient: Vec<Row>,
-    /// Cache lines of those that are not zeros.
-    seen: Vec<u32>,
+    /// For the numbers of cache lines of those that are not zeros.
+    lines: Vec<u32>,
     around: Around,
 }
 
@@ -88,7 +88,7 @@ impl WithSimd for TablePass<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> usize {
         let Self { task, table, state, rate, scratch } = self;
-        let TableScratch { gradient, seen, around } = &mut *scratch.mine();
+        let TableScratch { gradient, lines, around } = &mut *scratch.mine();
         let mut updated = 0;
         if let Some(rate) = rate {
             if gradient.len() < table.len() {
@@ -96,7 +96,7 @@ impl WithSimd for TablePass<'_> {
             }
             let gradient = &mut gradient[..table.len()];
             task.scatter(gradient, around);
-            updated = state.update(simd, table, gradient, rate, seen);
+            updated = state.update(simd, table, gradient, rate, lines);
         }
         task.encode(table, around);
         updated

@@ -113,9 +113,13 @@ impl Mlp {
         Self { layers: layers.collect(), asked: widths[0], widths }
     }
 
-    /// The same network, of whose inputs the last `given` have nothing that could learn: nobody asks for their gradient, and it need not
-    /// be computed.
+    /// The same network, of whose inputs the last `given` (at most all) have nothing that could learn: nobody asks for their gradient, and
+    /// it need not be computed.
+    ///
+    /// # Panics
+    /// If there are not as many inputs, or a layer sees them again.
     pub fn with_given(self, given: usize) -> Self {
+        assert!(given <= self.widths[0], "{given} of {} inputs", self.widths[0]);
         assert!(
             self.layers.iter().all(|layer| layer.again == 0),
             "an input that is seen twice learns as a whole"

@@ -191,7 +191,7 @@ pub fn keep_lanes(values: &mut [f32], layout: Layout, kept: &[u32], first: usize
 /// for it.
 #[inline(always)]
 pub fn interpolate(table: &[Vec4], corners: &Corners, ahead: Option<&Corners>, out: &mut [Vec4]) -> bool {
-    assert!(out.len() <= TILE && (out.is_empty() || corners.last_row(out.len()) < table.len()));
+    assert!(out.len() <= TILE && corners.are_within(out.len(), table.len()));
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx") {
         // SAFETY: this processor has the instructions, and the table the rows.
@@ -205,7 +205,7 @@ pub fn interpolate(table: &[Vec4], corners: &Corners, ahead: Option<&Corners>, o
 /// As [`super::rows::scatter`], likewise.
 #[inline(always)]
 pub fn scatter(table: &mut [Vec4], corners: &Corners, ahead: Option<&Corners>, g: &[Vec4]) -> bool {
-    assert!(g.len() <= TILE && (g.is_empty() || corners.last_row(g.len()) < table.len()));
+    assert!(g.len() <= TILE && corners.are_within(g.len(), table.len()));
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx") {
         // SAFETY: this processor has the instructions, and the table the rows.
